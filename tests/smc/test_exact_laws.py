@@ -32,8 +32,7 @@ from mstfilter.smc import (
 )
 from mstfilter.smc.diverse_resampling import optimal_threshold
 from mstfilter.smc.resampling import inverse_cdf
-from mstfilter.smc.testing.copies import ConstantGenerator as Uniform
-from tests.smc.enumeration import outcomes
+from tests.smc.enumeration import ConstantGenerator as Uniform, outcomes
 
 
 def log_of(weights):

@@ -41,8 +41,8 @@ from mstfilter.smc import (
 )
 from mstfilter.smc.diverse_resampling import leader_clusters
 from mstfilter.smc.resampling import draw_rows, independent_draws, inverse_cdf, search
-from mstfilter.smc.testing.copies import ConstantGenerator
 from mstfilter.smc.wrapped_resampling import hilbert_position
+from tests.smc.enumeration import ConstantGenerator
 
 EQUAL: list[WeightResampler] = [Multinomial(), Stratified(), Systematic(), Residual(), Ssp(), Killing()]
 PLAIN: list[Resampler] = [

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import html
 from collections.abc import Mapping, Sequence
-from functools import singledispatch
 from typing import Any
 
 import matplotlib.style
@@ -23,7 +22,7 @@ from matplotlib.figure import Figure
 
 from mstfilter.app.report.identities import match_objects, weigh_distinct
 from mstfilter.app.report.page import short_text
-from mstfilter.app.report.pictures import Colour, colour, data_uri, jpeg_bytes, png_bytes, viewpoint, voxel_picture
+from mstfilter.app.report.pictures import colour, data_uri, jpeg_bytes, png_bytes, viewpoint, voxel_picture
 from mstfilter.mst.belief import Belief
 from mstfilter.scene import Clip, Frame, Hypothesis, Recording
 from mstfilter.smc import Infos, Population, State, as_matrix
@@ -40,11 +39,6 @@ class Drawing(Figure):
         file = io.BytesIO()
         self.savefig(file, format="png", dpi=110, bbox_inches="tight")
         return file.getvalue()
-
-
-def colours_of(hypothesis: Hypothesis) -> dict[int, Colour]:
-    """Mapping from labels to colours of the palette, in the order of the objects."""
-    return {record.label: colour(k) for k, record in enumerate(hypothesis.objects)}
 
 
 @matplotlib.style.context("mstfilter.app.report.figures")
@@ -78,19 +72,27 @@ def plot_recording(recording: Recording) -> Drawing:
 def plot_population(population: Population) -> Drawing:
     """The six most probable hypotheses; for numeric particles, weighted histograms of the first six coordinates."""
     population = population.realised()
-    if _are_hypotheses(population):
-        return _plot_hypotheses(population)
+    if shown := pictures_of(population):
+        columns = min(3, len(shown))
+        rows = -(-len(shown) // columns)
+        figure = Drawing(figsize=(3.2 * columns, 2.6 * rows), layout="constrained")
+        for axis in figure.subplots(rows, columns, squeeze=False).ravel():
+            axis.set_axis_off()
+        for axis, (picture, text) in zip(figure.axes, shown, strict=False):
+            axis.imshow(picture)
+            axis.set_title(text, fontsize=12)
+        return figure
     named = population.particles if isinstance(population.particles, Mapping) else {"x": population.particles}
-    columns = {}
+    columns_of: dict[str, np.ndarray] = {}
     for name, values in named.items():
-        rows = as_matrix(np.asarray(values)) if not isinstance(values, tuple) else as_matrix(values)
-        several = rows.shape[1] > 1
-        columns.update({f"{name}[{j}]" if several else name: rows[:, j] for j in range(rows.shape[1])})
-    shown = list(columns)[:_MOST_PICTURES]
-    figure = Drawing(figsize=(2.6 * len(shown) + 0.6, 2.6), layout="constrained")
-    axes = figure.subplots(1, len(shown), squeeze=False)[0]
-    for axis, name in zip(axes, shown, strict=True):
-        axis.hist(columns[name], bins=40, weights=population.weights, color="C0")
+        rows_of = as_matrix(values if isinstance(values, tuple) else np.asarray(values))
+        several = rows_of.shape[1] > 1
+        columns_of |= {f"{name}[{j}]" if several else name: column for j, column in enumerate(rows_of.T)}
+    names = list(columns_of)[:_MOST_PICTURES]
+    figure = Drawing(figsize=(2.6 * len(names) + 0.6, 2.6), layout="constrained")
+    axes = figure.subplots(1, len(names), squeeze=False)[0]
+    for axis, name in zip(axes, names, strict=True):
+        axis.hist(columns_of[name], bins=40, weights=population.weights, color="C0")
         axis.set(xlabel=name, yticks=[])
         axis.spines[["left", "right", "top"]].set_visible(False)
     axes[0].set_ylabel("weight")
@@ -98,46 +100,20 @@ def plot_population(population: Population) -> Drawing:
     return figure
 
 
-def _are_hypotheses(population: Population) -> bool:
-    """Whether the particles are hypotheses; `Candidates` are not built."""
-    return isinstance(population.particles, tuple) and isinstance(population.particles[0], Hypothesis)
-
-
-def _plot_hypotheses(population: Population) -> Drawing:
-    pictures = _voxel_pictures(population)
-    columns = min(3, len(pictures))
-    rows = -(-len(pictures) // columns)
-    figure = Drawing(figsize=(3.2 * columns, 2.6 * rows), layout="constrained")
-    for axis in figure.subplots(rows, columns, squeeze=False).ravel():
-        axis.set_axis_off()
-    for axis, (picture, text) in zip(figure.axes, pictures, strict=False):
-        axis.imshow(picture)
-        axis.set_title(text, fontsize=12)
-    return figure
-
-
-def _voxel_pictures(population: Population) -> list[tuple[np.ndarray, str]]:
-    """Pictures of the most probable distinct hypotheses from one viewpoint, with captions."""
-    particles, groups = population.particles, weigh_distinct(population.particles, population.weights.tolist())
-    weights = [weight for _, weight in groups[:_MOST_PICTURES]]
-    shown = [particles[members[0]] for members, _ in groups[:_MOST_PICTURES]]
-    view = viewpoint(shown, width=420, height=315)
-    return [
-        (voxel_picture(h.labels, h.grid, view, colours), f"weight {weight:.2f}, {h.n_objects} objects")
-        for h, weight, colours in zip(shown, weights, match_objects(shown, weights), strict=True)
-    ]
-
-
 def to_html(value: Any) -> str:
     """HTML that shows an object of the package in a notebook: text, and pictures or a table of steps."""
     text = f'<pre style="margin:0">{html.escape(repr(value))}</pre>'
-    style = "display:inline-block;margin:4px 8px 4px 0"
-    cells = [
-        f'<figure style="{style}"><img alt="{html.escape(words)}" height="{height}" src="{uri}">'
-        f"<figcaption>{html.escape(words)}</figcaption></figure>"
-        for uri, words, height in _pictures(value)
-    ]
-    more = _table(value.rows()) if isinstance(value, Infos) else "".join(cells)
+    shown = [] if isinstance(value, Infos) else pictures_of(value)
+    height = 150 if len(shown) > 1 else 240
+    more = _table(value.rows()) if isinstance(value, Infos) else ""
+    for picture, caption in shown:
+        photo = picture.shape[2] == 3
+        uri = data_uri(jpeg_bytes(picture), "jpeg") if photo else data_uri(png_bytes(picture))
+        words = html.escape(caption)
+        more += (
+            f'<figure style="display:inline-block;margin:4px 8px 4px 0"><img alt="{words}" height="{height}" '
+            f'src="{uri}"><figcaption>{words}</figcaption></figure>'
+        )
     return f'<div style="max-width:60em">{text}<div style="overflow-x:auto">{more}</div></div>'
 
 
@@ -148,53 +124,39 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> str:
     return f"<table>{''.join(f'<tr>{line}</tr>' for line in cells)}</table>"
 
 
-#: Data URI, caption and height in pixels.
-_Picture = tuple[str, str, int]
+def pictures_of(value: Any) -> list[tuple[np.ndarray, str]]:
+    """Pictures of an object with captions: photos (H, W, 3), and voxels (H, W, 4). `Candidates` are not built."""
+    if isinstance(value, Belief | State):
+        value = value.population
+    if isinstance(value, Hypothesis):
+        colours = {record.label: colour(k) for k, record in enumerate(value.objects)}
+        view = viewpoint([value], width=480, height=360)
+        return [(voxel_picture(value.labels, value.grid, view, colours), ".show() can be rotated")]
+    if isinstance(value, Population):
+        return _voxel_pictures(value)
+    photos: list[tuple[Frame, str]] = []
+    if isinstance(value, Frame):
+        photos = [(value, "colour")]
+    elif isinstance(value, Clip):
+        photos = [(value.before, "before"), (value.after, "after")][-len(value) :]
+    elif isinstance(value, Recording):
+        photos = [(value.frames[value.pauses[t]], f"pause {t}") for t in _evenly(range(len(value.pauses)), 4)]
+    steps = [max(1, frame.camera.width // 320) for frame, _ in photos]
+    return [(frame.rgb[::k, ::k], text) for k, (frame, text) in zip(steps, photos, strict=True)]
 
 
-@singledispatch
-def _pictures(value: Any) -> list[_Picture]:
-    return []
-
-
-def _photo(frame: Frame, text: str) -> _Picture:
-    step = max(1, frame.camera.width // 320)
-    return data_uri(jpeg_bytes(np.ascontiguousarray(frame.rgb[::step, ::step])), "jpeg"), text, 150
-
-
-@_pictures.register
-def _(value: Frame) -> list[_Picture]:
-    return [_photo(value, "colour")]
-
-
-@_pictures.register
-def _(value: Clip) -> list[_Picture]:
-    frames = [(value.before, "before"), (value.after, "after")]
-    return [_photo(*pair) for pair in (frames if len(value) > 1 else frames[1:])]
-
-
-@_pictures.register
-def _(value: Recording) -> list[_Picture]:
-    return [_photo(value.frames[value.pauses[t]], f"pause {t}") for t in _evenly(range(len(value.pauses)), 4)]
-
-
-@_pictures.register
-def _(value: Hypothesis) -> list[_Picture]:
-    view = viewpoint([value], width=480, height=360)
-    picture = voxel_picture(value.labels, value.grid, view, colours_of(value))
-    return [(data_uri(png_bytes(picture)), ".show() can be rotated", 240)]
-
-
-@_pictures.register
-def _(value: Population) -> list[_Picture]:
-    if not _are_hypotheses(value):
+def _voxel_pictures(population: Population) -> list[tuple[np.ndarray, str]]:
+    """The most probable distinct hypotheses from one viewpoint; empty if the particles are no hypotheses."""
+    particles = population.particles
+    if not (isinstance(particles, tuple) and isinstance(particles[0], Hypothesis)):
         return []
-    return [(data_uri(png_bytes(picture)), text, 150) for picture, text in _voxel_pictures(value)]
-
-
-@_pictures.register
-def _(value: Belief | State) -> list[_Picture]:
-    return [] if value.population is None else _pictures(value.population)
+    groups = weigh_distinct(particles, population.weights.tolist())[:_MOST_PICTURES]
+    weights, shown = [weight for _, weight in groups], [particles[members[0]] for members, _ in groups]
+    view = viewpoint(shown, width=420, height=315)
+    return [
+        (voxel_picture(h.labels, h.grid, view, colours), f"weight {weight:.2f}, {h.n_objects} objects")
+        for h, weight, colours in zip(shown, weights, match_objects(shown, weights), strict=True)
+    ]
 
 
 def _evenly(values: Sequence[int], n: int) -> list[int]:

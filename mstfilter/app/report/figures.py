@@ -86,7 +86,9 @@ def _svg_text(figure: Figure, title: str) -> str:
         f'<svg class="figure" style="max-width:{widest:.0f}px" viewBox="{view[1]}" role="img" aria-label="{title}">'
     )
     text = head + text[text.index(">") + 1 :]
-    text = re.sub(r"font(-family)?: ?[^;\"]*'[^;\"]*(;|(?=\"))", _keep_font_size, text)
+    # The page names the font. Of a shorthand, as other versions of matplotlib write it, the size remains.
+    text = re.sub(r"font: [^;\"]*?([\d.]+px)[^;\"]*", r"font-size: \1", text)
+    text = re.sub(r"font-family: [^;\"]*(;|(?=\"))", "", text)
     text = text.replace("xlink:href", "href")
     text = re.sub(r"(<g [^>]*)>\n((?:\s*<use [^>]*/>\n){2,})", _merge_styles, text)
     for mark, colour in _PAGE.items():
@@ -101,12 +103,6 @@ def _merge_styles(match: re.Match[str]) -> str:
     if len(styles) > 1 or "style=" in match[1]:
         return f"{match[1]}>\n{marks}"
     return f'{match[1]} style="{styles.pop()}">\n' + re.sub(r' style="[^"]*"', "", marks)
-
-
-def _keep_font_size(match: re.Match[str]) -> str:
-    """Keep the size of a CSS ``font`` shorthand and remove the font family."""
-    size = re.search(r"([\d.]+)px", match[0])
-    return "" if size is None else f"font-size: {size[1]}px;"
 
 
 def quality_figure(

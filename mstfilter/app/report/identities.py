@@ -21,6 +21,7 @@ from mstfilter.app.report.pictures import Colour, colour
 from mstfilter.runs import RunFolder
 from mstfilter.scene import Hypothesis
 from mstfilter.scoring import overlap
+from mstfilter.smc import first_seen
 
 TRUTH = -1  #: Index of the ground truth in place of a hypothesis
 
@@ -176,8 +177,6 @@ def names_of(indices: Sequence[int]) -> str:
 
 def weigh_distinct(hypotheses: Sequence[Hypothesis], weights: Sequence[float]) -> list[tuple[tuple[int, ...], float]]:
     """Indices and total weight of each group of identical hypotheses, from heavy to light."""
-    groups: dict[bytes, list[int]] = {}
-    for k, h in enumerate(hypotheses):
-        groups.setdefault(h.key, []).append(k)
-    found = [(tuple(members), float(sum(weights[k] for k in members))) for members in groups.values()]
-    return [found[g] for g in order_by_weight([weight for _, weight in found])]
+    which = first_seen(h.key for h in hypotheses)
+    mass = np.bincount(which, weights)
+    return [(tuple(np.flatnonzero(which == g).tolist()), float(mass[g])) for g in order_by_weight(mass.tolist())]

@@ -105,10 +105,6 @@ class PauseNumbers:
         """Quality of the best hypothesis; None without ground truth."""
         return None if self.quality is None else max(self.quality)
 
-    def parents(self, kind: str) -> list[int] | None:
-        """Parent of each hypothesis, of `kind` ``"previous"`` or ``"proposed"``; None if parents are not recorded."""
-        return self.info["parents"].get(kind)
-
     def notes(self, slot: str) -> Mapping[str, Any]:
         """Extra values that the component of `slot` stored, except values that an earlier component also stored."""
         notes: Mapping[str, Mapping[str, Any]] = self.info["notes"]

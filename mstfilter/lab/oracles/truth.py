@@ -150,25 +150,16 @@ def bind_truth(component: T, recording: Recording) -> T:
 
 
 def _bind(component: Any, truth: RecordingTruth) -> Any:
-    changed = {}
-    for name, value in _components(component).items():
-        if isinstance(value, tuple):
-            bound = tuple(_bind(inner, truth) for inner in value)
-            if any(a is not b for a, b in zip(bound, value, strict=True)):
-                changed[name] = bound
-        elif (bound := _bind(value, truth)) is not value:
-            changed[name] = bound
-    if changed:
-        component = dataclasses.replace(component, **changed)
+    """A component or a tuple of them, of which those that use the truth are bound; the same object if none does."""
+    if isinstance(component, tuple):
+        parts = tuple(_bind(part, truth) for part in component)
+        return parts if any(a is not b for a, b in zip(parts, component, strict=True)) else component
+    if not dataclasses.is_dataclass(component) or isinstance(component, type):
+        return component
+    values = {f.name: getattr(component, f.name) for f in dataclasses.fields(component) if f.init}
+    bound = {name: part for name, value in values.items() if (part := _bind(value, truth)) is not value}
+    component = dataclasses.replace(component, **bound) if bound else component
     if isinstance(component, UsesTruth):
         truth.check(component.needs, type(component).__name__)
         component = component.bind(truth)
     return component
-
-
-def _components(component: Any) -> dict[str, Any]:
-    """Fields of a component that may hold components: dataclasses and tuples."""
-    if not dataclasses.is_dataclass(component) or isinstance(component, type):
-        return {}
-    values = {f.name: getattr(component, f.name) for f in dataclasses.fields(component) if f.init}
-    return {k: v for k, v in values.items() if isinstance(v, tuple) or dataclasses.is_dataclass(v)}

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import time
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from mstfilter.mst.testing.scenes import KnownMotion, known_motions, scene_example
+from mstfilter.mst.testing.scenes import known_motions, scene_example
 from mstfilter.scene import Hypothesis
 from mstfilter.smc import Population
 from mstfilter.smc.testing.contract import FALSE_ALARM, close, seeded, skips_errors, statistical
-from mstfilter.smc.testing.moves import ProposalContract, TransitionContract
+from mstfilter.smc.testing.transitions import TransitionContract
+from mstfilter.smc.testing.updates import ProposalContract
 from mstfilter.smc.testing.values import ScoreContract, SimilarityContract
 
 _COPIES, _CALLS = 4, 40
@@ -82,7 +84,7 @@ class SceneTransitionContract(TransitionContract):
     def test_objects_move_as_they_are_seen_to(self) -> None:
         """In a clip of a known push, the pushed box does not move backwards, and the others do not move."""
         known = known_motions()[0]
-        shifts = self._shifts(known, 8)
+        shifts = self.shifts[:8]
         push = np.asarray(known.motions[1].translation)
         for label, motion in known.motions.items():
             seen = shifts[:, :, label - 1]
@@ -108,8 +110,7 @@ class SceneTransitionContract(TransitionContract):
         """Copies of one hypothesis move by the same law, whatever their places in the population."""
         from scipy.stats import ks_2samp
 
-        known = known_motions()[0]
-        found = self._shifts(known, _CALLS)
+        found = self.shifts
         shifts = np.nan_to_num(found).reshape(len(found), _COPIES, -1)
         if len(found) < _CALLS:
             self.remarks.append(f"{len(found)} of {_CALLS} calls, for want of time")
@@ -122,13 +123,15 @@ class SceneTransitionContract(TransitionContract):
                     "depend on the place"
                 )
 
-    def _shifts(self, known: KnownMotion, calls: int) -> np.ndarray:
+    @cached_property
+    def shifts(self) -> np.ndarray:
         """(calls, 4, 3, 3) shifts in metres of the boxes of four copies of a hypothesis; NaN if a box is lost."""
-        population, component = Population((known.before,) * _COPIES), self.make()
+        known, component = known_motions()[0], self.make()
+        population = Population((known.before,) * _COPIES)
         centres = _centres(known.before, known.before)
         found = []
         start = time.monotonic()
-        for k in range(calls):
+        for k in range(_CALLS):
             if k >= 3 and time.monotonic() + 1.5 * (time.monotonic() - start) / k > self.until:
                 break  # enough to see a large fault
             self.check_time()
@@ -139,7 +142,7 @@ class SceneTransitionContract(TransitionContract):
                 continue
             rows = [np.flatnonzero(parents == copy)[:1] for copy in range(_COPIES)]
             found.append([_centres(moved.particles[int(r[0])], known.before) if len(r) else centres for r in rows])
-        return np.array(found) - centres if found else np.zeros((calls, _COPIES, *centres.shape))
+        return np.array(found) - centres if found else np.zeros((_CALLS, _COPIES, *centres.shape))
 
 
 def _centres(hypothesis: Hypothesis, origin: Hypothesis) -> np.ndarray:

@@ -64,8 +64,7 @@ class Pause:
     info: Info  #: the record of the step
     latency_s: float  #: seconds from the push of the last frame to the result
     #: Numbers of frames so far: "pushed"; dropped for the reasons "late", "ahead" (a stamp far ahead), "no depth" or
-    #: "overflow" (queue is full);
-    #: "thinned", which are removed from a long clip.
+    #: "overflow" (the queue is full); "thinned", which are removed from a long clip.
     counts: dict[str, int]
 
     @property
@@ -227,10 +226,10 @@ class Stream:
             return self._dropped(why, number, pause)
         if self._queue.full() and not wait:  # before the images are copied
             return self._dropped("overflow", number, pause)
-        camera = self._camera
-        if not isinstance(camera, Camera):
-            camera = Camera(camera, np.shape(rgb)[1], np.shape(rgb)[0])
-        known = camera
+        known = self._camera
+        if not isinstance(known, Camera):
+            known = Camera(known, np.shape(rgb)[1], np.shape(rgb)[0])
+        camera = known
         if self._posed not in (None, pose is not None):
             text = f"frame {number} has {'a' if self._posed is False else 'no'} pose, unlike the frames before"
             raise InputError(text, "give the pose of every frame, or of none; leave out a frame without a known pose")
@@ -365,8 +364,6 @@ class Stream:
         rests = found if item.pause is None else item.pause
         if self._world is None:
             if not rests:  # the first clip is the first pause alone
-                if self._step is None:
-                    self._step = self._pool.submit(self._load, item.frame, self._state)
                 return
             self._world, self._grid, self._shift = find_world(item.frame, self._grid)
         camera = item.frame.camera
@@ -431,12 +428,6 @@ class Stream:
         self._track()
 
     # --- thread of the filter -----------------------------------------------------------------------------------
-    def _load(self, frame: Frame, state: State) -> None:
-        """Filter a frame before the first pause to load libraries and networks, and discard the result."""
-        with contextlib.suppress(Exception):  # the frame need not show the scene at rest
-            camera, grid, _ = find_world(frame, self._grid)
-            self._filter.step(state, Clip([replace(frame, camera=camera)], grid))
-
     def _filter_clip(self, clip: Clip, items: tuple[_Item, ...], trackers: tuple[Any, ...]) -> None:
         """Filter a clip. The argument `trackers` keeps the tracked flow in memory until the filter uses the flow."""
         try:

@@ -152,7 +152,7 @@ class Worker:
 # In the worker process:
 
 
-def main() -> None:
+def serve() -> None:
     """Perform jobs from standard input until it is closed. All other output goes to the log."""
     lines, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     with open(os.devnull, "rb") as nothing:
@@ -329,4 +329,4 @@ def peak_megabytes() -> float:
 
 
 if __name__ == "__main__":
-    main()
+    serve()

@@ -5,16 +5,18 @@ from mstfilter.smc.testing.contract import (
     check_properties as check_properties,
 )
 from mstfilter.smc.testing.models import ModelContract as ModelContract
-from mstfilter.smc.testing.moves import (
-    DensityTransitionContract as DensityTransitionContract,
-    ProposalContract as ProposalContract,
-    RejuvenationContract as RejuvenationContract,
-    TransitionContract as TransitionContract,
-    UpdateContract as UpdateContract,
-)
 from mstfilter.smc.testing.resampling import (
     ResamplerContract as ResamplerContract,
     WeightResamplerContract as WeightResamplerContract,
+)
+from mstfilter.smc.testing.transitions import (
+    DensityTransitionContract as DensityTransitionContract,
+    RejuvenationContract as RejuvenationContract,
+    TransitionContract as TransitionContract,
+)
+from mstfilter.smc.testing.updates import (
+    ProposalContract as ProposalContract,
+    UpdateContract as UpdateContract,
 )
 from mstfilter.smc.testing.values import (
     CodecContract as CodecContract,

@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, TypeVar
 from unittest import SkipTest, mock
 
 import numpy as np
@@ -70,6 +70,7 @@ class Contract:
 
     returns: ClassVar[type] = object  #: type of the result of a call
     until = math.inf  #: value of `time.monotonic` at which a test ends; `check_properties` sets it
+    tested = "out of time"  #: what is said if the test ends there; a test may say how far it came
 
     def make(self) -> Any:
         """The component to test."""
@@ -109,14 +110,14 @@ class Contract:
 
     @cached_property
     def remarks(self) -> list[str]:
-        """What a test says although the property holds."""
+        """What the test that is running says although the property holds."""
         return []
 
     def check_time(self, seconds: float = 0.0, what: str = "") -> None:
         """End the test if its time is used up, or if less than `seconds` are left for what comes next."""
         left = self.until - time.monotonic()
         if left <= 0 or seconds > left:
-            raise OutOfTime(what or "out of time")
+            raise OutOfTime(what or self.tested)
 
     @property
     def on_numbers(self) -> bool:
@@ -261,6 +262,9 @@ class CheckResult:
     remark: str = ""  #: what else the test found
 
 
+_STOPPED = "not tested: first fix what is broken above"
+
+
 def check_properties(
     component: Any,
     contract: type[Contract],
@@ -290,46 +294,35 @@ def check_properties(
     stopped = False
     names = (name for cls in reversed(tests.__mro__) for name in vars(cls) if name.startswith("test_"))
     distinct = list(dict.fromkeys(names))  # those of base classes first
+    instance = tests()  # one for all tests, which share draws
     for name in distinct:
-        test, instance = getattr(tests, name), tests()
-        now = time.monotonic()
+        test, now = getattr(tests, name), time.monotonic()
+        instance.remarks, instance.tested = [], contract.tested
         instance.until = end if name == distinct[-1] else now + 0.5 * (end - now)
-        outcome = _STOPPED if stopped else _outcome(getattr(instance, name))
-        stopped = stopped or (outcome.failure is not None and getattr(test, "prerequisite", False))
-        if outcome.failure is not None and any(result.failure == outcome.failure for result in results):
-            outcome = _Outcome(skipped="same failure as above")
+        outcome = {"skipped": _STOPPED} if stopped else _outcome(getattr(instance, name))
+        stopped = stopped or ("failure" in outcome and getattr(test, "prerequisite", False))
+        if "failure" in outcome and any(result.failure == outcome["failure"] for result in results):
+            outcome = {"skipped": "same failure as above"}
         statement = (inspect.getdoc(test) or name).split("\n")[0]
         statistical = getattr(test, "statistical", False)
         remark = "; ".join(dict.fromkeys(instance.remarks))
-        results.append(CheckResult(name.removeprefix("test_"), statement, statistical, *outcome, remark))
+        results.append(CheckResult(name.removeprefix("test_"), statement, statistical, **outcome, remark=remark))
         if progress is not None:
             progress(results[-1])
     return results
 
 
-class _Outcome(NamedTuple):
-    """The first fields of a `CheckResult` that a test decides."""
-
-    failure: str | None = None
-    skipped: str | None = None
-    out_of_time: bool = False
-
-
-_STOPPED = _Outcome(skipped="not tested: first fix what is broken above")
-
-
-def _outcome(test: Callable[[], None]) -> _Outcome:
+def _outcome(test: Callable[[], None]) -> dict[str, Any]:
+    """The fields of a `CheckResult` that a test decides."""
     try:
         test()
-    except OutOfTime as reason:
-        return _Outcome(skipped=str(reason), out_of_time=True)
     except SkipTest as reason:
-        return _Outcome(skipped=str(reason))
+        return {"skipped": str(reason), "out_of_time": isinstance(reason, OutOfTime)}
     except AssertionError as error:
-        return _Outcome(str(error))
+        return {"failure": str(error)}
     except Exception as error:
-        return _Outcome(describe_error(error))
-    return _Outcome()
+        return {"failure": describe_error(error)}
+    return {}
 
 
 @contextmanager

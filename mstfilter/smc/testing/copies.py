@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from statistics import NormalDist
-from unittest import SkipTest
 
 import numpy as np
 
@@ -166,17 +165,3 @@ def fault_message(sample: Sample, column: int) -> str:
         f"{m} particles to {n}: copies are biased: {who} (W = {expected:.3g}) carries {n * mean:.3f} mean weights on "
         f"average, expected {n * expected:.3f}"
     )
-
-
-class ConstantGenerator(np.random.Generator):
-    """A generator whose `random` always returns one value. Skips the test after 10,000 calls."""
-
-    def __init__(self, value: float) -> None:
-        super().__init__(np.random.PCG64(0))
-        self._value, self._calls = value, 0
-
-    def random(self, size=None, dtype=np.float64, out=None):  # type: ignore[no-untyped-def]
-        self._calls += 1
-        if self._calls > 10_000:
-            raise SkipTest("it does not end")
-        return self._value if size is None else np.full(size, self._value)

@@ -12,11 +12,19 @@ from unittest import SkipTest
 import numpy as np
 
 from mstfilter.smc import Population
-from mstfilter.smc.testing.contract import FALSE_ALARM, Contract, OutOfTime, seeded
+from mstfilter.smc.testing.contract import (
+    FALSE_ALARM,
+    Contract,
+    OutOfTime,
+    seeded,
+    skip_unless_properly_weighted,
+    statistical,
+)
 from mstfilter.smc.testing.copies import quantile
 
 _TAILS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025)
-SMALL, _SMALL_CALLS = 3, 3000  # particles, and calls, of the test with small populations
+_SMALL, _SMALL_CALLS = 3, 3000  # particles, and calls, of the test with small populations
+WeightedRows = tuple[np.ndarray, np.ndarray]  # (n, d) rows, (n,) log weights
 _LEVELS = np.array([*_TAILS, *np.arange(0.05, 1, 0.05), *(1 - p for p in reversed(_TAILS))])
 
 
@@ -58,34 +66,6 @@ class ExactContract(Contract):
         if n < self.n_draws:
             self.remarks.append(f"with {n} of {self.n_draws} draws, for want of time")
         return n
-
-    def compare_small(
-        self,
-        call: Callable[[int], tuple[np.ndarray, np.ndarray]],
-        exact: np.ndarray,
-        exact_lw: np.ndarray,
-        independent: bool = True,
-    ) -> np.ndarray:
-        """Compare many calls with three particles with exact draws. Returns the log weights of all calls.
-
-        With many particles a fault of order 1 / n does not show, as that of a mean over the population.
-        ``call(k)`` returns the rows of call k, and what their log weights are compared by. Rows of one call need not
-        be `independent` if they are drawn by strata, sorted or antithetic.
-        """
-        rows, weights = [], []
-        for k in range(_SMALL_CALLS):
-            self.check_time(what=f"out of time after {k} of {_SMALL_CALLS} small populations")
-            found, lw = call(k)
-            rows.append(found)
-            weights.append(lw)
-        self.compare_weighted(np.concatenate(rows), np.concatenate(weights), exact, exact_lw)
-        for j in range(exact.shape[1]):
-            if independent and all(len(row) == SMALL for row in rows):
-                pairs = np.array([row[:2, j] for row in rows])
-                check_uncorrelated(
-                    pairs[:, 0], pairs[:, 1], 20 * exact.shape[1], f"coordinate {j} of {self.columns} of two of three"
-                )
-        return np.concatenate(weights)
 
     def compare_weighted(self, found: np.ndarray, lw: np.ndarray, exact: np.ndarray, exact_lw: np.ndarray) -> None:
         """Compare the weighted distributions of rows, for each column and for the sums of pairs of columns.
@@ -140,6 +120,63 @@ class ExactContract(Contract):
             for who, (a, b) in pairs.items():
                 n = min(len(a), len(b))
                 check_uncorrelated(a[:n, j], b[:n, j], n_tests, f"coordinate {j} of {self.columns} of {who}")
+
+
+class DrawsContract(ExactContract):
+    """Properties of components that draw or move particles: their results have the exact distribution.
+
+    A contract defines what is compared: `rows_of`, the results of a call, and `exact_rows`, the same of exact draws.
+    """
+
+    independent: ClassVar[bool] = True  #: False if the rows of a call may be drawn by strata, sorted or antithetic
+
+    def rows_of(self, case: tuple[Any, ...], rows: np.ndarray, rng: np.random.Generator) -> WeightedRows:
+        """Rows and log weights that the component makes of some rows of a case of `exact`."""
+        raise NotImplementedError
+
+    def exact_rows(self, case: tuple[Any, ...]) -> WeightedRows:
+        """Rows and log weights of the exact draws of a case."""
+        raise NotImplementedError
+
+    @statistical
+    def test_distribution_is_exact(self) -> None:
+        """Weighted results have the exact distribution and mean weight, and particles are independent."""
+
+        def drawn(n: int) -> WeightedRows:
+            return self.rows_of(self.exact_case(1, n), seeded(4).permutation(n), seeded(2))
+
+        skip_unless_properly_weighted(self.make())
+        self.exact_case(1, 1)
+        n = self.draws_in_time(drawn)
+        found = drawn(n)
+        self.compare_rows(found, self.exact_rows(self.exact_case(3, n)))
+        if self.independent and len(found[0]) == n:
+            self.check_independent(found[0])
+
+    @statistical
+    def test_small_populations_are_exact(self) -> None:
+        """Populations of three particles have the exact distribution, over many calls.
+
+        With many particles a fault of order 1 / n does not show, as that of a mean over the population.
+        """
+        skip_unless_properly_weighted(self.make())
+        case, calls = self.exact_case(1, _SMALL * _SMALL_CALLS), []
+        for k in range(_SMALL_CALLS):
+            self.tested = f"out of time after {k} of {_SMALL_CALLS} small populations"
+            calls.append(self.rows_of(case, np.arange(_SMALL * k, _SMALL * (k + 1)), seeded(k)))
+        x, lw = map(np.concatenate, zip(*calls, strict=True))
+        self.compare_rows((x, lw), self.exact_rows(self.exact_case(3, 50_000)))
+        if self.independent and all(len(x) == _SMALL for x, _ in calls):
+            pairs = np.array([x[:2] for x, _ in calls])
+            for j in range(pairs.shape[2]):
+                first, second = pairs[:, :, j].T
+                what = f"coordinate {j} of {self.columns} of two of three"
+                check_uncorrelated(first, second, 20 * pairs.shape[2], what)
+
+    def compare_rows(self, found: WeightedRows, exact: WeightedRows) -> None:
+        """Compare the distributions of weighted rows, and their mean weights."""
+        self.compare_weighted(*found, *exact)
+        check_mean_weight(np.exp(found[1]), np.exp(exact[1]))
 
 
 def check_parents(result: Population, name: str, n: int) -> None:

@@ -7,7 +7,6 @@ import pytest
 
 import mstfilter
 from mstfilter.app.report.display import Drawing
-from mstfilter.base.lazy import exported
 from mstfilter.base.resources import preset_names
 from mstfilter.mst.testing import scene_example
 from mstfilter.runs import filter_recording
@@ -77,16 +76,6 @@ def test_text_and_html_are_short_and_complete(name):
         assert len(made) < 1_000_000
 
 
-def test_texts_hold_the_facts():
-    assert repr(SCENES.particles[0]).splitlines()[0] == f"Hypothesis of {SCENES.particles[0].n_objects} objects"
-    assert "24 x 24 x 8 voxels of 20 mm" in repr(CLIP)
-    assert "3 frames over 0.4 s" in repr(CLIP)
-    assert repr(STATE.population).startswith("Population: n = 50, float64 (50, 1), ESS ")
-    assert "n = 1000, candidates, 0 built" in repr(OBJECTS["candidates"])
-    assert "log evidence -" in repr(STATE)
-    assert "resampler Systematic" in repr(OBJECTS["preset"])
-
-
 def test_the_texts_of_components_name_changed_fields():
     for name in preset_names():
         made = mstfilter.preset(name)
@@ -101,12 +90,6 @@ def test_the_texts_of_components_name_changed_fields():
 
     assert repr(Plain()) == "Plain()"
     assert repr(Tempered(power=0.25, scheme=Ssp())) == "Tempered(scheme=Ssp(), power=0.25)"
-
-
-def test_the_front_door_names_classes_that_can_be_shown():
-    for name in ("Recording", "Clip", "Frame", "Hypothesis", "Population", "Belief"):
-        assert name in exported(mstfilter.__file__)
-        assert callable(getattr(mstfilter, name)._repr_html_)
 
 
 def test_plots():

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from mstfilter.app.report.identities import TRUTH, assign_identities
-from mstfilter.app.report.page import flatten, note_rows, short_text
 from mstfilter.app.report.pictures import (
     PALETTE,
     UNASSIGNED_COLOUR,
@@ -148,18 +147,3 @@ def test_close_up_holds_the_objects_and_keeps_the_proportions():
     assert x <= columns.min() and columns.max() <= x + width and y <= rows.min() and rows.max() <= y + height
     assert x >= 0 and y >= 0 and x + width <= CAMERA.width + 0.1 and y + height <= CAMERA.height + 0.1
     assert close_up([(np.zeros_like(labels), GRID)], CAMERA) == (0, 0, CAMERA.width, CAMERA.height)
-
-
-def test_tables():
-    assert flatten({"a": {"b": 1, "c": {}}, "d": [1]}) == {"a.b": 1, "d": [1]}
-    assert [short_text(v) for v in (None, True, 3, 0.123456, "x", [], [2, 2, 2])] == [
-        "–",
-        "yes",
-        "3",
-        "0.1235",
-        "x",
-        "none",
-        "2 (all 3)",
-    ]
-    assert short_text(list(range(100))) == "median 49.5, 0 to 99"
-    assert note_rows([{"a": 1}, {"b": {"c": 2}}]) == [("a", ["1", ""]), ("b.c", ["", "2"])]

@@ -77,21 +77,6 @@ def test_the_page_is_self_contained(finished):
     assert str(run.path) not in text and str(run.path.parent) not in text
 
 
-def test_contents_of_the_page(finished):
-    _run, path = finished
-    text, page = read(path)
-    assert "two boxes" in page.text and "seed 7" in page.text
-    assert "3 hypotheses" in page.text and "after 3 pauses" in page.text
-    for words in ("motions.static", "nothing moved", "sampler.acceptance", "transition", "one blob", "sample size"):
-        assert words in page.text
-    assert "connected components" in page.text and "own.py:Stay" in page.text
-    # One picture of the camera a pause, used by every card of it; truth and heaviest are drawn at the top too.
-    assert text.count("data:image/jpeg") == 3
-    assert text.count("Truth</b>") == 3
-    # At one pause, all hypotheses are equal.
-    assert text.count("<b>Disagreement</b>") == 2
-
-
 def test_text_of_the_user_is_escaped(finished):
     _, path = finished
     text, page = read(path)
@@ -143,18 +128,6 @@ def test_interrupted_runs(tmp_path):
     assert "0 of 3 pauses" in page.text and "Full configuration" in page.text
 
 
-def test_notes_of_any_shape(tmp_path):
-    run = make_run(tmp_path / "run", pauses=2)
-    info = run.info(1)
-    info["notes"] = {
-        "update": {"deep": {"er": [[1, 2], "x", None]}},
-        "own slot": {"n": 1e-9, "none": [], "flag": True},
-    }
-    (run.pause(1) / "info.json").write_text(json.dumps(info))
-    _, page = read(write_report(run))
-    assert "deep.er" in page.text and "own slot" in page.text and "1e-09" in page.text
-
-
 def test_the_first_picture_is_the_estimate(tmp_path):
     """Of hypotheses with equal weights the first is a random draw; the estimate agrees best with all of them."""
     run = make_run(tmp_path / "run", pauses=1)
@@ -170,29 +143,6 @@ def test_the_first_picture_is_the_estimate(tmp_path):
     assert [view.members for view in views[1:-1]] == [(k,) for k in range(3) if (k,) != views[0].members]
     k = next(k for k in range(3) if made[k].key == estimate.key)
     assert f"The estimate at the last pause, over the image: hypothesis #{k}" in read(write_report(run))[1].text
-
-
-def test_only_the_heaviest_of_many_hypotheses_have_cards(tmp_path):
-    run = make_run(tmp_path / "run", pauses=1)
-    from dataclasses import replace
-
-    first = run.hypotheses(0)[0]
-    many = []
-    for k in range(20):
-        labels = np.zeros(first.labels.shape, np.uint16)
-        labels[k % 15, 3:6, :2] = 1
-        labels[15 - k % 15, 9:12, : 1 + k // 15] = 2
-        many.append(replace(first, labels=labels, objects=type(first).from_labels(labels, first.grid).objects))
-    state = State(1, Population(tuple(many)), Key(7), False)
-    save_state(run.pause(0) / "state.npz", state, HypothesisCodec())
-    info = run.info(0)
-    info |= {"weights": [1 / 20] * 20, "n": 20, "quality": {f: [0.5] * 20 for f in info["quality"]}}
-    info["parents"] = {"proposed": list(range(20))}
-    (run.pause(0) / "info.json").write_text(json.dumps(info))
-    _, page = read(write_report(run))
-    assert (
-        "The estimate and the 11 most probable of the others are shown; the rest has 40 % of the weight." in page.text
-    )
 
 
 def test_errors(tmp_path):
@@ -245,31 +195,6 @@ def test_compared_runs_stand_beside_the_run(tmp_path):
     assert read_numbers(run).steps[0].compared == {"without past": np.mean(other.info(0)["quality"]["objects"])}
     text, _ = read(write_report(run))
     assert "without past" in re.search(r'<svg class="figure".*?</svg>', text, flags=re.S)[0]
-
-
-def test_hidden_objects_are_named(tmp_path, monkeypatch):
-    """The second box stands behind a wall from pause 1 on, which the first box has become."""
-    hidden = labels_of((12, 8, 3))
-
-    def truth(t):
-        labels = hidden * 2
-        labels[10:18, 4:6, :9] = 1 if t else 0
-        labels[3:7, 8:12, :5] = 0 if t else 1
-        return labels.astype(np.uint16)
-
-    monkeypatch.setattr("tests.app.report.runs.truth_at", truth)
-    run = make_run(tmp_path / "run", pauses=2)
-    numbers = read_numbers(run)
-    assert [step.metrics["n_visible"] for step in numbers.steps] == [2, 1]
-    assert numbers.steps[1].metrics["n_hidden"] == 1
-    quality = np.mean([best_overlap(h.labels, truth(1) == 2) for h in run.hypotheses(1)])
-    assert f"1 hidden, seen before {quality:.2f}" in read(write_report(run))[1].text
-
-
-def best_overlap(labels, mask):
-    """Largest intersection over union of an object with a mask."""
-    overlaps = [np.sum((labels == k) & mask) / np.sum((labels == k) | mask) for k in range(1, labels.max() + 1)]
-    return max(overlaps, default=0.0)
 
 
 def with_comparison(path, quality, loss):

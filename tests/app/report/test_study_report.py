@@ -6,16 +6,13 @@ import html
 import json
 import re
 import shutil
-from importlib.resources import files
 
 import numpy as np
 import pytest
 
-from mstfilter.app.report.figures import SERIES
 from mstfilter.app.report.study_report import write_study_report
 from mstfilter.base.errors import InputError
 from mstfilter.runs.study import RESULT, StudyFolder, summarise
-from mstfilter.runs.study.summary import ArmMetric
 from tests.app.report.pages import Page
 from tests.app.report.runs import make_run
 from tests.app.test_cli import call
@@ -97,12 +94,6 @@ def test_the_same_study_gives_the_same_page(tmp_path):
     assert write_study_report(study, tmp_path / "b.html").read_bytes() == first
 
 
-@pytest.mark.parametrize("arms", [("ours",), tuple("abcdefghijk")])
-def test_few_and_many_arms(tmp_path, arms):
-    text = write_study_report(make_study(tmp_path, n_scenes=2, arms=arms, groups=("s1",), fail=False)).read_text()
-    assert ("Paired differences" in text) == (len(arms) > 1)
-
-
 def test_more_arms_than_colours_are_drawn_in_several_figures(tmp_path):
     """Each with the reference, points and boxes; none is left out."""
     arms = tuple(f"arm {k}" for k in range(15))
@@ -135,11 +126,12 @@ def test_null_in_a_result(tmp_path):
     for change in ({"qualities": [0.5, None, 0.6]}, {"qualities": [None]}, {"qualities": None}, {"quality": None}):
         rows = [{**row, **change} for row in done["rows"]]
         paths["done"].write_text(json.dumps({**done, "rows": rows}))
-        assert write_study_report(study).is_file() and len(StudyFolder.open(study).rows()) == n
+        assert len(StudyFolder.open(study).rows()) == n
+    assert write_study_report(study).is_file()
     for name in ("error", "hints", "trace", "tries"):
         paths["failed"].write_text(json.dumps({**failed, name: [None] if name == "hints" else None}))
         StudyFolder.open(study).write_tables()
-        assert write_study_report(study).is_file() and StudyFolder.open(study).failures() == []
+        assert StudyFolder.open(study).failures() == []
 
 
 def test_a_study_without_results_has_a_page(tmp_path):
@@ -156,12 +148,6 @@ def test_command(tmp_path, capsys):
         write_study_report(tmp_path)
 
 
-def test_every_arm_has_a_colour():
-    style = (files("mstfilter.app.report") / "templates" / "style.css").read_text()
-    for k in range(len(SERIES)):
-        assert f"--s{k}: #" in style and f".s{k} {{" in style
-
-
 def test_arms_that_use_the_ground_truth_are_marked(tmp_path):
     study = make_study(tmp_path, groups=("s1",), fail=False)
     assert "uses the ground truth" not in write_study_report(study).read_text()
@@ -174,12 +160,6 @@ def test_arms_that_use_the_ground_truth_are_marked(tmp_path):
     )
 
 
-def test_intervals_stay_within_the_values_of_the_metric():
-    for values in ((0.99, 0.5, 0.98), (0.0, 9.0), (-0.5, 1.0)):
-        low, high = ArmMetric("s1", "a", "quality", dict(enumerate(values))).interval
-        assert min(values) <= low < np.mean(values) < high <= max(values)
-
-
 def test_times_leave_out_the_seed_that_fills_the_cache():
     rows = [
         {"family": "s1", "scene": "a", "arm": "x", "seed": seed, "pause": 0, "seconds": value}
@@ -187,21 +167,6 @@ def test_times_leave_out_the_seed_that_fills_the_cache():
     ]
     assert summarise(rows, "x", ["seconds"]).metric("s1", "x", "seconds").mean == 1.5
     assert summarise(rows[:1], "x", ["seconds"]).metric("s1", "x", "seconds").mean == 9.0
-
-
-def test_nothing_in_a_figure_is_cut_off(tmp_path):
-    """With long names, every text begins and ends inside the figure; its width is estimated from its letters."""
-    arms = ("ours", "a method with quite a long name, n = 20")
-    text = write_study_report(make_study(tmp_path, n_scenes=2, arms=arms, groups=("s1",), fail=False)).read_text()
-    for svg in re.findall(r'<svg class="figure".*?</svg>', text, flags=re.S):
-        width = float(re.search(r'viewBox="\S+ \S+ (\S+) ', svg)[1])
-        text_of = r'font-size: ([\d.]+)px; +text-anchor: (\w+)[^>]* x="([-\d.]+)"[^>]*rotate\(-0[^>]*>([^<]+)'
-        drawn = re.findall(text_of, svg)
-        assert drawn
-        for size, anchor, x, words in drawn:
-            long = 0.5 * float(size) * len(words)
-            before = {"start": 0.0, "middle": 0.5, "end": 1.0}[anchor] * long
-            assert float(x) - before >= -2 and float(x) - before + long <= width + 2, words
 
 
 def results(study):
@@ -271,13 +236,3 @@ def test_pictures_of_the_largest_differences(tmp_path):
         first, second = part.split("<h4>")[1:3]
         pictures = [re.findall(r'<image href="(.*?)"', one) for one in (first, second)]
         assert pictures[0] == pictures[1] and pictures[0]
-
-
-def test_times_say_whether_the_cache_was_warm(tmp_path):
-    study = make_study(tmp_path, groups=("s1",), fail=False)
-    text = write_study_report(study).read_text()
-    assert "All times are with a warm cache" in text and "step, warm cache" in text
-    for folder in (study / "runs").glob("*_1"):
-        (folder / RESULT).unlink()
-    text = write_study_report(study).read_text()
-    assert "not with equally warm caches" in text and "step, warm cache" not in text

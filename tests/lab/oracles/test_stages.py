@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import tomllib
-
 import pytest
 
 from mstfilter.lab.oracles import uses_truth
 from mstfilter.lab.oracles.stages import STAGES
 from mstfilter.runs.presets import build_filter, describe_filter, load_config
-from tests.conftest import REPOSITORY
 from tests.lab.baselines.test_presets import differences
 
 #: A filter without any estimate: true masks need no boundary, and the best candidates are selected.
@@ -65,13 +62,3 @@ def test_with_all_stages_replaced_nothing_is_estimated():
     for left in PERFECT_STAGES:
         fewer = described(*overrides_of(*(s for s in PERFECT_STAGES if s != left)))
         assert differences(fewer, describe_filter(filter)), left
-
-
-def test_the_experiment_has_all_arms():
-    """`mst`, each stage replaced alone, all stages, all stages but one."""
-    arms = {"mst": (), "all true": overrides_of(*PERFECT_STAGES)}
-    arms |= {f"true {stage}": overrides_of(stage) for stage in STAGES}
-    arms |= {f"all but {stage}": overrides_of(*(s for s in PERFECT_STAGES if s != stage)) for stage in PERFECT_STAGES}
-    data = tomllib.loads((REPOSITORY / "experiments/error_budget/study.toml").read_text())
-    assert {arm["name"]: tuple(arm.get("set", ())) for arm in data["arms"]} == arms
-    assert data["reference"] == "mst"

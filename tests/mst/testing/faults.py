@@ -1,21 +1,47 @@
-"""Resamplers with one fault each, and correct ones."""
+"""Components of numbers with one fault each, at least one for every property of a contract, and correct ones.
+
+`experiments/planted` has two hundred more, of kinds that are not here.
+"""
 
 from __future__ import annotations
 
-import copy
-import random
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
 
-from mstfilter.smc import Population, Resampler, WeightResampler, log_mean_exp, normalise
-from tests.mst.testing import Faults, of
+from mstfilter.smc import (
+    Codec,
+    DensityTransition,
+    Equivalence,
+    Lookahead,
+    Normal,
+    Population,
+    Proposal,
+    Rejuvenation,
+    Resampler,
+    Similarity,
+    Size,
+    Transition,
+    Trigger,
+    Update,
+    WeightResampler,
+    log_mean_exp,
+    normalise,
+    union,
+)
+from tests.mst.testing import Faults, of, plainly
+from tests.smc.models import RHO, SD0, SIGMA, TAU, optimal, optimal_initial
 
 FAULTS = Faults()
 faulty, plant = FAULTS.faulty, FAULTS.plant
 
+_VALID, _REPEATS, _SCALE = "result_is_valid", "depends_on_its_arguments_only", "scale_of_weights_is_irrelevant"
+_INPUT, _ORDER = "does_not_change_input", "order_of_particles_is_irrelevant"
+_EXACT, _SMALL = "distribution_is_exact", "small_populations_are_exact"
 
+
+# --- resamplers ---------------------------------------------------------------------------------------------------
 def selected(function, rng, log_weights, n):
     found = function(rng, log_weights, n)
     return found if isinstance(found, tuple) else (found, None)
@@ -42,9 +68,6 @@ def multinomial(rng, weights, n):
     return np.searchsorted(np.cumsum(weights)[:-1], rng.random(n) * weights.sum(), side="right")
 
 
-# --- correct schemes ----------------------------------------------------------------------------------------------
-
-
 @selecting
 def Correct(rng, lw, n):
     return by_weight(rng, lw, n)
@@ -58,26 +81,11 @@ def CorrectWeighted(rng, lw, n):
     return ancestors, lw[ancestors] + np.log(even.mean())
 
 
-@dataclass(frozen=True)
-class RareHeaps(WeightResampler):
-    """In a call of a thousand, all copies are of one particle drawn by weight."""
-
-    rate: float = 0.001
-
-    def select(self, rng, log_weights, n):
-        weights = normalise(log_weights)
-        if rng.random() < self.rate:
-            return np.repeat(multinomial(rng, weights, 1), n), None
-        return systematic(rng, weights, n), None
-
-
 @selecting
-def RareBlocks(rng, lw, n):
-    """In a call of 500, blocks of a third of the positions get one draw."""
+def RareHeaps(rng, lw, n):
+    """In a call of a thousand, all copies are of one particle drawn by weight."""
     weights = normalise(lw)
-    if rng.random() < 0.002 and n >= 3:
-        return np.resize(np.repeat(multinomial(rng, weights, 3), -(-n // 3)), n)
-    return multinomial(rng, weights, n)
+    return np.repeat(multinomial(rng, weights, 1), n) if rng.random() < 0.001 else systematic(rng, weights, n)
 
 
 @dataclass(frozen=True)
@@ -95,21 +103,9 @@ class RandomNumber(WeightResampler):
 
 
 @selecting
-def SizeChanging(rng, lw, n):
-    """Even draws that carry their weight: the total weight is kept on average only."""
-    ancestors = rng.choice(np.flatnonzero(lw > -np.inf), n)
-    return ancestors, lw[ancestors] + np.log((lw > -np.inf).mean())
-
-
-@selecting
-def ZeroAtTheEdge(rng, lw, n):
-    """Picks a leading weight of zero where the uniform number is exactly 0, and none where it rounds to the end."""
-    return np.searchsorted(np.cumsum(normalise(lw)), (np.arange(n) + rng.random()) / n)
-
-
-def alias_table(weights):
-    """Vose's alias method: which columns keep their particle depends on rounding."""
-    m, share, alias = len(weights), len(weights) * weights, np.arange(len(weights))
+def Alias(rng, lw, n):
+    """Independent draws by Vose's alias method: which columns keep their particle depends on rounding."""
+    m, share, alias = len(lw), len(lw) * normalise(lw), np.arange(len(lw))
     small, large = list(np.flatnonzero(share < 1)), list(np.flatnonzero(share >= 1))
     while small and large:
         light, heavy = small.pop(), large.pop()
@@ -117,25 +113,16 @@ def alias_table(weights):
         share[heavy] -= 1 - share[light]
         (small if share[heavy] < 1 else large).append(heavy)
     share[small + large] = 1.0
-    return m, share, alias
-
-
-@selecting
-def Alias(rng, lw, n):
-    """Independent draws by the alias method."""
-    m, share, alias = alias_table(normalise(lw))
     column = rng.integers(m, size=n)
     return np.where(rng.random(n) < share[column], column, alias[column])
 
 
-CORRECT = (RareHeaps(), RareBlocks(), RandomNumber(), SizeChanging(), Alias(), ZeroAtTheEdge())
-
-_CARRIED, _VALID, _ZERO = "carried_weight", "result_is_valid", "zero_weights_are_never_chosen"
-_SCALE, _PARENTS = "scale_of_weights_is_irrelevant", "keeps_parents"
+RESAMPLERS = (RareHeaps(), RandomNumber(), Alias())
 
 
-# --- wrong numbers of copies --------------------------------------------------------------------------------------
-def biased_residual(rng, lw, n):
+@faulty("carried_weight", "copies are biased")
+@selecting
+def BiasedResidual(rng, lw, n):
     """The remainder is drawn from W - copies instead of n W - copies: light particles are selected too rarely."""
     W = normalise(lw)
     copies = np.floor(n * W)
@@ -150,147 +137,10 @@ def rest_to_the_last(rng, lw, n):
     return np.repeat(np.arange(len(lw)), copies)
 
 
-def first_always_stays(rng, lw, n):
-    drawn = systematic(rng, normalise(lw), max(n - 1, 1))
-    return np.concatenate([[np.flatnonzero(lw > -np.inf)[0]], drawn])[:n]
-
-
-def ties_to_the_first(rng, lw, n):
-    """Finds particles by their weight."""
-    _, first, index = np.unique(lw, return_index=True, return_inverse=True)
-    return first[index[by_weight(rng, lw, n)]]
-
-
-def one_position(rng, lw, n):
-    """The first position always goes to the heaviest particle, if n = m."""
-    ancestors = by_weight(rng, lw, n)
-    if n == len(lw) > 1:
-        ancestors[0] = np.argmax(lw)
-    return ancestors
-
-
-def halves(rng, lw, n):
-    """The halves of a population are resampled apart, if n = m is even."""
-    weights, half = normalise(lw), n // 2
-    if n != len(weights) or n % 2 or min(weights[:half].sum(), weights[half:].sum()) == 0:
-        return systematic(rng, weights, n)
-    return np.concatenate([systematic(rng, weights[:half], half), half + systematic(rng, weights[half:], half)])
-
-
-def odd_is_special(rng, lw, n):
-    found = by_weight(rng, lw, n)
-    if n % 2 and n > 1:
-        found[-1] = found[0]
-    return found
-
-
-def more_than_there_are(rng, lw, n):
-    """If n > m every particle is kept once, and the rest is drawn."""
-    weights, m = normalise(lw), len(lw)
-    if n <= m or (weights == 0).any():
-        return systematic(rng, weights, n)
-    return np.concatenate([np.arange(m), systematic(rng, weights, n - m)])
-
-
-def winner_takes_all(rng, lw, n):
-    weights = normalise(lw)
-    return np.full(n, np.argmax(weights)) if weights.max() > 0.9 else systematic(rng, weights, n)
-
-
-_CACHE: dict = {}
-
-
-def module_cache(rng, lw, n):
-    """Cached by the sizes, beside the class."""
-    return systematic(rng, _CACHE.setdefault((len(lw), n), normalise(lw)), n)
-
-
-plant(
-    selecting,
-    IgnoresN=(_VALID, "asked to make", lambda rng, lw, n: by_weight(rng, lw, len(lw))),
-    NoDuplicates=(_VALID, "asked to make", lambda rng, lw, n: np.unique(by_weight(rng, lw, n))),
-    PicksZeroWeights=(_ZERO, "weight 0", rest_to_the_last),
-    # Counts particles from 1.
-    OffByOne=(_VALID, "expected 0 to", lambda rng, lw, n: by_weight(rng, lw, n) + 1),
-    AsFloats=(_VALID, "float64, expected integers", lambda rng, lw, n: by_weight(rng, lw, n).astype(float)),
-)
-plant(
-    selecting,
-    _CARRIED,
-    "copies are biased",
-    BiasedResidual=biased_residual,
-    FirstAlwaysStays=first_always_stays,
-    # Counts particles from 1, inside the range.
-    OffByOneClipped=lambda rng, lw, n: (by_weight(rng, lw, n) + 1) % len(lw),
-    KeepsAll=lambda rng, lw, n: np.arange(n) if n == len(lw) else by_weight(rng, lw, n),
-    TiesToTheFirst=ties_to_the_first,
-    OnePosition=one_position,
-    Halves=halves,
-    OddIsSpecial=odd_is_special,
-    MoreThanThereAre=more_than_there_are,
-    ModuleCache=module_cache,
-    SeedIgnored=lambda rng, lw, n: by_weight(np.random.default_rng(0), lw, n),
-    CopiesTheGenerator=lambda rng, lw, n: by_weight(copy.deepcopy(rng), lw, n),
-    # Selects by weight and keeps the weight, so the weight counts twice.
-    OldWeightsKept=lambda rng, lw, n: (ancestors := by_weight(rng, lw, n), lw[ancestors]),
-    EightBits=lambda rng, lw, n: by_weight(rng, lw, n).astype(np.uint8).astype(int),
-    WinnerTakesAll=winner_takes_all,
-    SingleIsHeaviest=lambda rng, lw, n: np.array([np.argmax(lw)]) if n == 1 else by_weight(rng, lw, n),
-)
-plant(
-    selecting,
-    "many_particles",
-    SixteenBits=("expected 0 to 100000", lambda rng, lw, n: by_weight(rng, lw, n).astype(np.int16).astype(int)),
-)
-plant(
-    of(WeightResampler, {"exact_size": False}, select=selected),
-    MoreThanAsked=(_VALID, "asked to make", lambda rng, lw, n: by_weight(rng, lw, n + 1)),
-)
-#: Schemes that select by changed weights, ``function(W, n)`` of the normalised ones.
-weighing = of(WeightResampler, select=lambda f, rng, lw, n: (systematic(rng, f(normalise(lw), n), n), None))
-plant(
-    weighing,
-    _CARRIED,
-    "copies are biased",
-    AtMostHalf=lambda W, n: np.minimum(W, 0.5),
-    FloorOfWeights=lambda W, n: np.where(W > 0, np.maximum(W, 0.02), 0.0),
-    # Particles below a thousandth of the largest weight are dropped, if n = m.
-    DropsLight=lambda W, n: W * ((1e-3 if n == len(W) else 0.0) * W.max() <= W),
-    # A power of the weights, if n = m, or if there are more than a hundred.
-    Flattens=lambda W, n: W ** (0.9 if n == len(W) else 1.0),
-    SharpensMany=lambda W, n: W ** (1.1 if len(W) > 100 else 1.0),
-    # If there are more than twenty times as many as are selected, the light ones are left out.
-    HeaviestOfMany=lambda W, n: np.where(np.sort(W)[-20 * n] <= W, W, 0.0) if len(W) > 20 * n else W,
-    # Sorts by weight and forgets to sort back.
-    OrderMatters=lambda W, n: np.sort(W)[::-1],
-)
-# Cumulates in single precision: small weights are lost.
-plant(weighing, "many_particles", SinglePrecisionSum=("single precision", lambda W, n: W.astype(np.float32)))
-# Independent draws hide a small bias best: the largest weight is 1 % too large, or 5 % if it is above 0.6.
-plant(
-    of(WeightResampler, select=lambda f, rng, lw, n: (multinomial(rng, f(normalise(lw)), n), None)),
-    _CARRIED,
-    "copies are biased",
-    OnePercent=lambda W: np.where(W.max() == W, 1.01, 1.0) * W,
-    HeavyGains=lambda W: np.where(W > 0.6, 1.05, 1.0) * W,
-)
-
-
-# --- scale, generators and state ----------------------------------------------------------------------------------
-def dropped_by_absolute_weight(rng, lw, n):
-    return systematic(rng, np.where(lw > -50, np.exp(lw), 0.0), n)
-
-
-def single_precision_overflow(rng, lw, n):
-    """exp in single precision overflows at 88."""
-    weights = np.exp(lw.astype(np.float32))
-    return systematic(rng, weights / weights.sum(), n)
-
-
-def python_generator(rng, lw, n):
-    found = by_weight(rng, lw, n)
-    random.shuffle(found)
-    return found
+def one_percent(rng, lw, n):
+    """The largest weight is 1 % too large; independent draws hide it best."""
+    W = normalise(lw)
+    return multinomial(rng, np.where(W.max() == W, 1.01, 1.0) * W, n)
 
 
 def in_place_if_equal(rng, lw, n):
@@ -299,27 +149,30 @@ def in_place_if_equal(rng, lw, n):
     return by_weight(rng, lw, n)
 
 
-_OWN = np.random.default_rng(5)
-_REPEATS = "depends_on_its_arguments_only"
 plant(
     selecting,
-    _REPEATS,
-    "come from `rng`",
-    GlobalIfMore=lambda rng, lw, n: multinomial(np.random if n > len(lw) else rng, normalise(lw), n),
-    PythonGenerator=python_generator,
-    OwnGenerator=lambda rng, lw, n: by_weight(np.random.default_rng(), lw, n),
-    ModuleGenerator=lambda rng, lw, n: by_weight(_OWN, lw, n),
-)
-plant(
-    selecting,
-    DroppedByAbsoluteWeight=(_SCALE, "log weights", dropped_by_absolute_weight),
-    SinglePrecisionOverflow=(_SCALE, "overflow", single_precision_overflow),
-    SinglePrecisionOutput=(
-        _SCALE,
-        "do not add it",
-        lambda rng, lw, n: (by_weight(rng, lw, n), np.full(n, log_mean_exp(lw)).astype(np.float32)),
+    IgnoresN=(_VALID, "asked to make", lambda rng, lw, n: by_weight(rng, lw, len(lw))),
+    PicksZeroWeights=("zero_weights_are_never_chosen", "weight 0", rest_to_the_last),
+    OnePercent=("carried_weight", "copies are biased", one_percent),
+    # Equal weights, but not those that keep the evidence.
+    WeightsForgotten=(
+        "carried_weight",
+        "mean weight after selection",
+        lambda rng, lw, n: (by_weight(rng, lw, n), np.full(n, -np.log(n))),
     ),
-    InPlaceIfEqual=("does_not_change_input", "in place", in_place_if_equal),
+    # Cumulates in single precision: small weights are lost.
+    SinglePrecisionSum=(
+        "many_particles",
+        "single precision",
+        lambda rng, lw, n: systematic(rng, normalise(lw).astype(np.float32), n),
+    ),
+    OwnGenerator=(_REPEATS, "come from `rng`", lambda rng, lw, n: by_weight(np.random.default_rng(), lw, n)),
+    DroppedByAbsoluteWeight=(
+        _SCALE,
+        "log weights",
+        lambda rng, lw, n: systematic(rng, np.where(lw > -50, np.exp(lw), 0.0), n),
+    ),
+    InPlaceIfEqual=(_INPUT, "in place", in_place_if_equal),
 )
 plant(
     of(WeightResampler, {"draws": False}, select=selected),
@@ -339,56 +192,22 @@ class FirstCallCached(WeightResampler):
         return systematic(rng, weights, n), None
 
 
-# --- output, particles and parents --------------------------------------------------------------------------------
-plant(
-    selecting,
-    _CARRIED,
-    # Equal weights, but not those that keep the evidence.
-    WeightsForgotten=(
-        "mean weight after selection",
-        lambda rng, lw, n: (by_weight(rng, lw, n), np.full(n, -np.log(n))),
-    ),
-    # The evidence is the mean of the positive weights.
-    MeanOfPositive=(
-        "by the number of all particles",
-        lambda rng, lw, n: (by_weight(rng, lw, n), np.full(n, log_mean_exp(lw[lw > -np.inf]))),
-    ),
-)
-
-
 def correctly_chosen(function, rng, population, n):
     ancestors = rng.permutation(systematic(rng, population.weights, n))
-    return function(population.select(ancestors, np.full(n, population.log_mean_weight)), rng)
+    return function(population.select(ancestors, np.full(n, population.log_mean_weight)))
 
 
-def without_proposed(chosen, rng):
-    return chosen.labelled({k: v for k, v in chosen.parents.items() if k != "proposed"})
-
-
-#: Resamplers whose correct selection ``function(chosen, rng)`` changes.
 plant(
     of(Resampler, resample=correctly_chosen),
-    ForgetsAncestors=(
-        _VALID,
-        'no parents "ancestor"',
-        lambda chosen, rng: Population(chosen.particles, chosen.log_weights),
-    ),
-    LosesProposed=(_PARENTS, '"proposed"', without_proposed),
-    MovesSelected=(
-        _PARENTS,
-        "not those of the ancestors",
-        lambda chosen, rng: chosen.moved(chosen.particles + 0.01 * rng.standard_normal(len(chosen))),
-    ),
-    # The ancestors are sorted after the particles were taken.
-    SortsAncestors=(
-        _PARENTS,
-        "not those of the ancestors",
-        lambda chosen, rng: chosen.with_ancestors(np.sort(chosen.parents["ancestor"])),
+    LosesProposed=(
+        "keeps_parents",
+        '"proposed"',
+        lambda chosen: chosen.labelled({k: v for k, v in chosen.parents.items() if k != "proposed"}),
     ),
 )
 
 
-@FAULTS.faulty("carried_weight_of_equal_particles", "of equal particles")
+@faulty("carried_weight_of_equal_particles", "of equal particles")
 @dataclass(frozen=True)
 class KeepsHeaviestOfEqual(Resampler):
     """Merges equal particles and keeps the heaviest of them, which then carries the weight of all."""
@@ -404,4 +223,381 @@ class KeepsHeaviestOfEqual(Resampler):
         return population.select(kept[index], np.full(n, population.log_mean_weight))
 
 
-BiasedResidual = next(fault for fault, *_ in FAULTS if fault.__name__ == "BiasedResidual")
+# --- exact draws --------------------------------------------------------------------------------------------------
+def exact_ar1(rng, n):
+    """x_{t-1}, draws of p(x_t | x_{t-1}, y_t), y_t."""
+    previous = rng.normal(0.2, 1.0, n)
+    return Population(previous), Population(optimal(previous, 0.7).sample(rng, n)), 0.7
+
+
+def exact_walk(rng, n):
+    """x_{t-1}, draws of x_t given them by the AR(1) model, y_t; the move does not use y_t."""
+    previous = rng.normal(0.2, 1.0, n)
+    return Population(previous), Population(rng.normal(RHO * previous, SIGMA)), 0.7
+
+
+def exact_moves(rng, n):
+    """x_{t-1}, draws of x_t given them, y_t, log p(y_t | x_t)."""
+    return *exact_walk(rng, n), lambda x: Normal(x, TAU).log_prob(0.7)
+
+
+def exact_density(rng, n):
+    previous = rng.standard_normal(n)
+    return Population(previous), Population(rng.normal(previous, 1.0)), 0.5
+
+
+def exact_posterior(rng, n):
+    """Draws of p(x), of p(x | y), y."""
+    prior, posterior = rng.normal(0.0, SD0, n), optimal_initial(0.7).sample(rng, n)
+    return Population(prior), Population(posterior), 0.7
+
+
+def exact_weights(rng, n):
+    """Draws of p(x), the same with weights p(y | x), y."""
+    prior = Population(rng.normal(0.0, SD0, n))
+    return prior, prior.reweighted(log_g(prior.particles, 0.7)), 0.7
+
+
+def exact_evidence(rng, n):
+    """Draws of p(x), of p(x | y), y, log p(y)."""
+    return *exact_posterior(rng, n), float(Normal(0.0, float(np.hypot(SD0, TAU))).log_prob(0.7))
+
+
+def exact_prior(rng, n):
+    """Draws of p(x_0), y."""
+    return Population(rng.normal(0.0, SD0, n)), 0.7
+
+
+# --- transitions --------------------------------------------------------------------------------------------------
+#: A transition that replaces the particles by ``function(rng, x, y)``.
+move = of(
+    Transition,
+    predict=lambda f, rng, population, observation: population.moved(f(rng, population.particles, observation)),
+)
+
+
+def walk(x, noise):
+    return RHO * x + SIGMA * noise
+
+
+def step(rng, x, size=1.0):
+    """Moves by independent noise of a size."""
+    return walk(x, size * rng.standard_normal(len(x)))
+
+
+def in_blocks(rng, x, size):
+    """One random number for every `size` particles."""
+    return np.repeat(rng.standard_normal(-(-len(x) // size)), size)[: len(x)]
+
+
+def of_few(rng, x, y):
+    """The noise of n particles has the variance (n - 1) / n, which many particles do not show."""
+    noise = rng.standard_normal(len(x))
+    return walk(x, noise - noise.mean())
+
+
+def first_is_special(rng, x, y):
+    noise = rng.standard_normal(len(x))
+    noise[0] *= 4
+    return x + noise
+
+
+def moves_in_place(rng, x, y):
+    x += 1
+    return x
+
+
+plant(
+    move,
+    NeedsObservation=(_VALID, "observation=None", lambda rng, x, y: x + float(y)),
+    Nan=(_VALID, "becomes nan", lambda rng, x, y: step(rng, x) * np.where(x > 0, 1, np.nan)),
+    MovesInPlace=(_INPUT, "in place", moves_in_place),
+    OwnSeed=(
+        _REPEATS,
+        "never uses its generator",
+        lambda rng, x, y: x + np.random.default_rng(0).standard_normal(len(x)),
+    ),
+    WideStep=(_EXACT, "and sd", lambda rng, x, y: step(rng, x, 1.05), exact_walk),
+    CutNoise=(_EXACT, "is below", lambda rng, x, y: walk(x, rng.standard_normal(len(x)).clip(-2.8, 2.8)), exact_walk),
+    SharedByBlocks=(_EXACT, "of neighbours", lambda rng, x, y: walk(x, in_blocks(rng, x, 8)), exact_walk),
+    OfFew=(_SMALL, "weighted distribution is wrong", of_few, exact_walk),
+    MeanOfOthers=(
+        "moves_do_not_depend_on_others",
+        "mean or spread",
+        lambda rng, x, y: 0.9 * x + 0.1 * x.mean() + rng.standard_normal(len(x)),
+    ),
+    FirstIsSpecial=(_ORDER, "moves differently", first_is_special),
+    OneNoise=(_ORDER, "do not move independently", lambda rng, x, y: walk(x, rng.standard_normal())),
+)
+plant(
+    of(Transition, predict=plainly),
+    NormalisesWeights=(
+        _SCALE,
+        "do not add it",
+        lambda rng, population, y: replace(population, log_weights=np.log(population.weights)),
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Guided(Transition):
+    """Draws from p(x_t | x_{t-1}, y_t) of the AR(1) model; the weights have a factor."""
+
+    factor: float = 1.0
+    size: float = 1.0
+
+    def predict(self, rng, population, observation):
+        x = population.particles
+        if observation is None:
+            return population.moved(step(rng, x, self.size))
+        q = optimal(x, observation)
+        new = q.sample(rng, len(x))
+        change = Normal(RHO * x, SIGMA).log_prob(new) - q.log_prob(new)
+        return population.moved(new).reweighted(self.factor * change)
+
+
+@faulty(_EXACT, "is below", exact_moves)
+@dataclass(frozen=True)
+class NoWeights(Guided):
+    """Draws from the optimal proposal without weights."""
+
+    factor: float = 0.0
+
+
+@faulty("moves_without_observation_are_exact", "and sd", exact_moves)
+@dataclass(frozen=True)
+class WideWithoutObservation(Guided):
+    size: float = 1.2
+
+
+#: A random step of standard deviation 1 with the log density ``function(previous, new)``.
+density = of(
+    DensityTransition,
+    predict=lambda f, rng, population, y: population.moved(rng.normal(population.particles)),
+    log_prob=lambda f, previous, new, y: f(previous, new),
+)
+
+
+@density
+def CorrectDensity(previous, new):
+    """The density without its constant factor."""
+    return -0.5 * (new - previous) ** 2
+
+
+plant(
+    density,
+    # The density of all moves together.
+    OneDensity=("log_prob_is_of_each_move", "have shape ()", lambda x, new: -0.5 * np.sum((new - x) ** 2)),
+    WiderDensity=(
+        "log_prob_is_the_density_of_its_moves",
+        "certain which is",
+        lambda x, new: Normal(x, 1.1).log_prob(new),
+    ),
+)
+
+
+# --- updates ------------------------------------------------------------------------------------------------------
+def log_g(x, y):
+    return Normal(x, TAU).log_prob(y)
+
+
+def weighted(function, rng, predicted, proposed, observation):
+    population = union(predicted, proposed)
+    return population.reweighted(function(population.particles, observation))
+
+
+#: An update that adds ``function(x, y)`` to the log weights.
+likelihood = of(Update, update=weighted)
+#: An update that weights by the likelihood and returns ``function(rng, weighted, predicted)``.
+changed = of(
+    Update,
+    update=lambda f, rng, predicted, proposed, observation: f(
+        rng, weighted(log_g, rng, predicted, proposed, observation), predicted
+    ),
+)
+_POSTERIOR = "weights_are_those_of_the_posterior"
+
+
+@likelihood
+def Posterior(x, y):
+    return log_g(x, y)
+
+
+@changed
+def CorrectNoise(rng, out, predicted):
+    """Random factors of mean 1."""
+    return out.reweighted(np.log(rng.standard_exponential(len(out))))
+
+
+plant(
+    likelihood,
+    TooWide=(_POSTERIOR, "is below", lambda x, y: Normal(x, 1.1 * TAU).log_prob(y), exact_posterior),
+    Twice=(_POSTERIOR, "constant factors", lambda x, y: log_g(x, y) + np.log(2), exact_evidence),
+    TwiceByWeight=(_POSTERIOR, "constant factor", lambda x, y: log_g(x, y) + np.log(2), exact_weights),
+    DividedByMean=(
+        "weight_of_a_particle_does_not_depend_on_others",
+        "not normalised or ranked",
+        lambda x, y: log_g(x, y) - log_mean_exp(log_g(x, y)),
+    ),
+    LaterRows=(_ORDER, "place in the array", lambda x, y: 0.1 * np.arange(len(x))),
+    LogOfNegative=("weights_of_distant_particles_are_numbers", "nan", lambda x, y: np.log(9 - (x - y) ** 2)),
+)
+plant(
+    of(Update, update=plainly),
+    NeedsPrediction=(
+        _VALID,
+        "proposed particles",
+        lambda rng, predicted, proposed, observation: predicted.reweighted(np.zeros(len(predicted))),
+    ),
+)
+plant(
+    changed,
+    PermutesUpdate=(
+        "parents_belong_to_their_particles",
+        "parent",
+        lambda rng, out, predicted: Population(out.particles[::-1], out.log_weights[::-1], out.parents),
+    ),
+)
+
+# --- proposals and rejuvenations ----------------------------------------------------------------------------------
+#: A proposal of ``function(rng, y, n)``: particles, or particles and log weights.
+proposal = of(
+    Proposal,
+    sample=lambda f, rng, y, n: Population(*found) if isinstance(found := f(rng, y, n), tuple) else Population(found),
+)
+
+
+def weighed(rng, y, n, factor=1.0):
+    q = Normal(0.0, 1.2 * SD0)
+    x = q.sample(rng, n)
+    return x, Normal(0.0, SD0).log_prob(x) - q.log_prob(x) + np.log(factor)
+
+
+def antithetic(rng, y, n):
+    """Less variance than independent draws, sorted."""
+    half = rng.standard_normal(-(-n // 2))
+    return SD0 * np.sort(rng.permutation(np.concatenate([half, -half]))[:n])
+
+
+plant(
+    proposal,
+    OneTooFew=(_VALID, "asked for 2 particles it returns 1", lambda rng, y, n: rng.standard_normal(max(n - 1, 1))),
+    FixedGrid=(_REPEATS, "never uses its generator", lambda rng, y, n: np.linspace(-2, 2, n)),
+    Narrow=(_EXACT, "is below", lambda rng, y, n: 0.97 * SD0 * rng.standard_normal(n), exact_prior),
+    WeightsOfMeanTwo=(_EXACT, "the mean weight is", lambda rng, y, n: weighed(rng, y, n, 2.0), exact_prior),
+    Pairs=(
+        "draws_vary_like_independent_ones",
+        "times the variance",
+        lambda rng, y, n: SD0 * in_blocks(rng, range(n), 2),
+        exact_prior,
+    ),
+)
+
+
+def moved_by(function, rng, population, previous, observation):
+    if previous is None or observation is None:
+        return population
+    return population.moved(function(rng, population.particles, previous.particles, observation))
+
+
+#: A rejuvenation ``function(rng, x, x_{t-1}, y)``; nothing moves if one of the last two is missing.
+kernel = of(Rejuvenation, move=moved_by)
+
+
+def metropolis(rng, x, previous, y, temperature=1.0):
+    """A Metropolis step for p(x_t | x_{t-1}, y_t), at a temperature."""
+
+    def log_p(v):
+        return (Normal(RHO * previous, SIGMA).log_prob(v) + log_g(v, y)) / temperature
+
+    new = x + 0.5 * rng.standard_normal(len(x))
+    return np.where(np.log1p(-rng.random(len(x))) < log_p(new) - log_p(x), new, x)
+
+
+plant(
+    kernel,
+    Hot=(
+        _EXACT,
+        "after five moves of exact draws",
+        lambda rng, x, previous, y: metropolis(rng, x, previous, y, 1.1),
+        exact_ar1,
+    ),
+    # Draws from p(x_t | y_t): the marginal is right, the joint distribution with x_{t-1} is wrong.
+    ForgetsTheParent=(
+        _EXACT,
+        "coordinate 1 of (x_t, x_t - x_{t-1})",
+        lambda rng, x, previous, y: optimal(rng.normal(0.2, 1.0, len(x)), y).sample(rng, len(x)),
+        exact_ar1,
+    ),
+)
+plant(
+    of(Rejuvenation, move=plainly),
+    WeighsMoves=(
+        _VALID,
+        "changes log weights",
+        lambda rng, p, previous, y: p.reweighted(rng.standard_normal(len(p))),
+    ),
+)
+
+# --- triggers, sizes, similarities, equivalences, lookaheads, codecs ----------------------------------------------
+plant(
+    of(Trigger, wants=plainly),
+    AbsoluteWeight=(_SCALE, "change its answer", lambda p, t: p.log_weights.max() < 0),
+    MaybeTrigger=(_VALID, "True or False", lambda p, t: p.ess),
+    EntropyOfZero=(
+        "weights_of_zero_count_like_tiny_ones",
+        "is 0 log 0 NaN?",
+        lambda p, t: bool(-(p.weights * np.log(p.weights)).sum() < 0.5 * np.log(len(p))),
+    ),
+)
+plant(of(Size, choose=plainly), HalfSize=(_VALID, "at least 1", lambda population: len(population) // 2))
+
+
+def distances(particles):
+    return np.abs(particles[:, None] - particles[None, :])
+
+
+def cosine(x):
+    rows = x.reshape(len(x), -1)
+    length = np.linalg.norm(rows, axis=1)
+    return np.abs(rows @ rows.T / np.outer(length, length)).clip(0, 1)
+
+
+plant(
+    of(Similarity, matrix=plainly),
+    Distance=(_VALID, "expected finite ones in [0, 1]", distances),
+    RelativeSimilarity=(_ORDER, "if only these", lambda x: 1 - distances(x) / max(distances(x).max(), 1e-12)),
+    Cosine=("works_for_vectors_anywhere", "if a particle is 0", cosine),
+)
+plant(
+    of(Equivalence, classes=plainly),
+    CountsFromOne=(_VALID, "classes are", lambda particles: np.arange(1, len(particles) + 1)),
+    AllDifferent=(_ORDER, "if there are copies", lambda particles: np.arange(len(particles))),
+)
+plant(
+    of(Lookahead, log_priority=plainly),
+    LooksAtWeights=("ignores_weights", "change the priorities", lambda p, y: p.log_weights + p.particles),
+    RulesOut=(_VALID, "-inf", lambda p, y: np.where(p.particles > 0.5, -np.inf, 0.0)),
+)
+#: A codec that stores ``{"x": function(particles)}`` and returns it as double precision.
+encodes = of(
+    Codec, encode=lambda f, particles: {"x": f(particles)}, decode=lambda f, arrays: arrays["x"].astype(np.float64)
+)
+plant(
+    encodes,
+    "decoded_particles_are_equal",
+    SinglePrecision=("not the same", lambda particles: particles.astype(np.float32)),
+    Pickles=("Python objects", lambda particles: np.array(list(particles), dtype=object)),
+)
+
+#: Correct components and their exact draws.
+CORRECT = [
+    (CorrectDensity(), exact_density),
+    (Guided(), exact_moves),
+    (Posterior(), exact_posterior),
+    (Posterior(), exact_weights),
+    (Posterior(), exact_evidence),
+    (CorrectNoise(), exact_weights),
+    *((proposal(draw)(), exact_prior) for draw in (weighed, antithetic)),
+    (kernel(metropolis)(), exact_ar1),
+]

@@ -33,12 +33,6 @@ from tests.mst.testing import of, plainly
 Change = Callable[..., Any]
 
 
-def torch_tensor(p: np.ndarray) -> Any:
-    import torch
-
-    return torch.tensor(np.asarray(p, np.float32), requires_grad=True)
-
-
 def with_value(p: np.ndarray, value: float) -> np.ndarray:
     """An array with another value in one place."""
     out = np.array(p, dtype=np.float64)
@@ -117,32 +111,19 @@ PROBABILITIES: dict[str, tuple[Change, str]] = {
     "logits": (logits, "of logits"),
     "log probabilities": (lambda p: np.log(np.maximum(p, 1e-9)), "of log probabilities"),
     "percent": (lambda p: 100 * p, "divide by 100"),
-    "grey": (lambda p: (255 * p).astype(np.uint8), "divide by 255"),
     "one nan": (lambda p: with_value(p, np.nan), "returns nan in 1 of"),
-    "inf": (lambda p: with_value(p, np.inf), "returns inf in 1 of"),
     "too large": (lambda p: with_value(p, 1.2), "to 1.2, expected 0 to 1"),
-    "negative": (lambda p: with_value(p, -0.1), "from -0.1"),
-    "complex": (lambda p: p.astype(complex), "type complex128"),
-    "text": (lambda p: p.astype(str), "expected bool or integers or floats"),
     "axes": (lambda p: p.transpose(2, 1, 0), "are the axes exchanged?"),
-    "one more axis": (lambda p: p[None], "an axis too many"),
     "flat": (lambda p: p.ravel(), "is it flattened?"),
-    "one number": (lambda p: p.mean(), "expected an array of shape"),
     "none": (lambda p: None, "does every branch of the method return it?"),
     "list": (lambda p: p.tolist(), "returns a list"),
-    "word": (lambda p: "full", "returns a str"),
-    "generator": (lambda p: (x for x in p), "returns a generator"),
-    "tensor with gradient": (lambda p: torch_tensor(p), "tensor.detach().cpu().numpy()"),
-    "masked": (lambda p: np.ma.masked_array(p, p > 0.5), "returns a masked array"),
     "exception": (one_over_zero, "my own fault"),
 }
 #: Other types of the same numbers, which are correct.
 GOOD_PROBABILITIES: dict[str, Change] = {
     "float16": lambda p: p.astype(np.float16),
     "bool": lambda p: p > 0.5,
-    "0 or 1": lambda p: (p > 0.5).astype(np.uint8),
     "rounded": lambda p: p.astype(np.float32) * np.float32(1.0000002),
-    "fortran": np.asfortranarray,
     "read-only": lambda p: np.broadcast_to(p, p.shape),
 }
 #: Changes that a run warns about once.
@@ -209,27 +190,16 @@ def nan_shift() -> RigidTransform:
 MOTIONS: dict[str, tuple[Change, str]] = {
     "none": (lambda found: None, "returns None, expected a tuple of Candidate"),
     "empty": (lambda found: (), "returns no candidate"),
-    "matrix": (lambda found: np.eye(4), "expected a tuple of Candidate"),
     "one candidate": (lambda found: found[0], "return (candidate,)"),
-    "matrices": (lambda found: (np.eye(4),), "RigidTransform.from_matrix(T)"),
-    "dict": (lambda found: dict(enumerate(found)), "returns a dict"),
-    "inner none": (lambda found: (found[0], None), "returns None, expected a Candidate"),
     "candidate of a matrix": (one_with(T=np.eye(4)), "whose T is an array of shape (4, 4)"),
-    "several motions": (one_with(T=RigidTransform.from_translation(np.zeros((3, 3)))), "a candidate with 3 motions"),
     "nan shift": (lambda found: (replace(found[1], T=nan_shift()),), "not finite"),
     "reflection": (one_with(T=matrix(reflect=True)), "it is a reflection"),
-    "scale": (one_with(T=matrix(1.05)), "its scale is 1.05"),
     "kind": (one_with(kind=3), "whose kind is 3"),
-    "support": (one_with(support=-2), "whose support is -2"),
     "share as support": (one_with(support=0.4), "whose support is 0.4"),
-    "nan score": (one_with(score=float("nan")), "whose score is nan"),
-    "scores": (one_with(score=np.zeros(2)), "whose score is an array of shape (2,)"),
     "exception": (one_over_zero, "my own fault"),
 }
 CHOICES: dict[str, tuple[Change, str]] = {
     "none": (lambda found: None, "returns None, expected a Candidate"),
-    "index": (lambda found: 0, "returns 0, expected a Candidate"),
-    "all": (lambda found: found, "returns a tuple"),
 }
 #: A motion in millimetres, of which a run warns once.
 TOO_FAR = one_with(T=RigidTransform.from_translation([15.0, 0, 0]))
@@ -270,19 +240,12 @@ class Scores(Evidence):
 #: Changes of scores (n,).
 SCORES: dict[str, tuple[Change, str]] = {
     "none": (lambda s: None, "returns None"),
-    "texts": (lambda s: s.astype(str), "expected integers or floats"),
-    "one": (lambda s: s[:1] if len(s) > 1 else np.zeros(2), "expected shape"),
-    "column": (lambda s: s[:, None], "an axis too many"),
-    "bool": (lambda s: s > 2, "type bool"),
     "nan": (lambda s: with_value(s, np.nan), "returns nan in 1 of"),
-    "-inf": (lambda s: with_value(s, -np.inf), "returns -inf in 1 of"),
     "all -inf": (lambda s: np.full_like(s, -np.inf), "bound it from below"),
     "exception": (one_over_zero, "my own fault"),
 }
 GOOD_SCORES: dict[str, Change] = {
     "int": lambda s: s.astype(int),
-    "float32": lambda s: s.astype(np.float32),
-    "float16": lambda s: s.astype(np.float16),
     "strided": lambda s: np.repeat(s, 2)[::2],
 }
 
@@ -341,25 +304,14 @@ def scaled(found: Any) -> Any:
 #: Changes of their results.
 OTHERS: dict[str, tuple[Change, str]] = {
     "boundary 0..255": (lambda b: 255 * b, "expected 0 to 1"),
-    "boundary axes": (np.transpose, "axes exchanged"),
     "tree parents": (lambda t: t.parent, "expected a Tree"),
     "values nan": (lambda w: with_value(w, np.nan), "returns nan"),
-    "values short": (lambda w: w[:-1], "expected shape"),
-    "cuts few": (lambda c: replace(c, cuts=c.cuts[:-1]), "expected"),
     "cuts partial": (cut_short, "no partition of the image"),
-    "masks few": (lambda m: m[:-1], "one for each input"),
-    "masks uint8": (lambda m: [x.astype(np.uint8) for x in m], "expected bool"),
-    "masks axes": (lambda m: [x.T for x in m], "axes exchanged"),
     "masks stacked": (np.array, "expected a list of masks"),
-    "registration matrix": (lambda r: np.eye(4), "expected a RegistrationResult"),
     "registration scale": (scaled, "its scale is 2"),
     "projection alone": (lambda p: p[0], "expected a hypothesis and a share"),
-    "projection labels": (lambda p: (p[0].labels, 1.0), "expected a Hypothesis"),
     "projection percent": (lambda p: (p[0], 98.0), "expected a number from 0 to 1"),
     "pairs nan": (lambda o: np.full_like(o, np.nan), "returns nan"),
-    "pairs short": (lambda o: o[:-1], "expected shape"),
-    "structure order": (lambda d: (d[0][:-1], []), "each vertex"),
-    "structure edge": (lambda d: (d[0], [(d[0][0], d[0][0])]), "no edge of the graph"),
     "structure backwards": (lambda d: (d[0], [(b, a) for a, b in d[1]]), "painted after its parent"),
 }
 

@@ -98,7 +98,8 @@ def test_check_names_what_is_broken(capsys):
 
 
 def test_check_of_registered_components_with_fields(capsys):
-    code, out, _ = call("check", "resampler.tempered", "power=0.25", "scheme=ssp", capsys=capsys)
+    given = ("check", "resampler.tempered", "power=0.25", "scheme=ssp", "--budget", "3600")
+    code, out, _ = call(*given, capsys=capsys)
     assert code == 0
     assert "Tempered: all properties that apply hold" in out
     for arguments, message in (

@@ -1,4 +1,4 @@
-"""The contracts compare components of scenes with known motions, and components of numbers with small exact cases."""
+"""The contracts compare components of scenes with clips whose motions are known."""
 
 from __future__ import annotations
 
@@ -22,9 +22,8 @@ from mstfilter.mst.tracking import (
     TrackingTransition,
 )
 from mstfilter.scene import FreeSpace, Hypothesis, Projection
-from mstfilter.smc import Population, Proposal, Similarity, Transition, Update, union
+from mstfilter.smc import Population, Proposal, Similarity, Transition
 from tests.mst.testing import run_property
-from tests.mst.testing.other_faults import exact_walk, move, proposal, step, update, walk
 
 MOVING = Candidate("mine", RigidTransform.from_translation([0.04, 0.0, 0.0]), score=1.0)
 
@@ -185,97 +184,3 @@ class LabelNumbers(Similarity):
 def test_similarities_do_not_compare_label_numbers():
     with pytest.raises(AssertionError, match="have no meaning"):
         run_scenes(LabelNumbers(), "numbers_of_labels_are_irrelevant")
-
-
-# --- components of numbers ----------------------------------------------------------------------------------------
-@update
-def by_position(rng, a, b, c):
-    population = union(a, b)
-    return population.reweighted(-np.abs(population.particles - c))
-
-
-class OtherNames(Update):
-    def update(self, g, before, new, y):
-        return by_position().update(g, before, new, y)
-
-
-def test_components_are_called_by_position():
-    assert [r.failure for r in run_contract(OtherNames()) if r.failure] == []
-
-
-def of_few(rng, x, y):
-    """The noise of n particles has the variance (n - 1) / n, which many particles do not show."""
-    noise = rng.standard_normal(len(x))
-    return walk(x, noise - noise.mean())
-
-
-def overlapping(rng, x, y):
-    noise = rng.standard_normal(len(x) + 1)
-    return x + np.stack([noise[:-1], noise[1:]], axis=1)
-
-
-NUMBERS = {
-    "small populations": (move(of_few), "small_populations_are_exact", "weighted distribution is wrong", exact_walk),
-    "mean of the others": (
-        move(lambda rng, x, y: 0.9 * x + 0.1 * x.mean() + rng.standard_normal(len(x))),
-        "moves_do_not_depend_on_others",
-        "mean or spread",
-        None,
-    ),
-    "spread of the others": (
-        move(lambda rng, x, y: x + x.std() * rng.standard_normal(len(x))),
-        "moves_do_not_depend_on_others",
-        "mean or spread",
-        None,
-    ),
-    "noise by place": (
-        move(lambda rng, x, y: x + rng.standard_normal() * np.linspace(-1, 1, len(x))),
-        "order_of_particles_is_irrelevant",
-        "independently|differently",
-        None,
-    ),
-    "own seed": (
-        move(lambda rng, x, y: x + np.random.default_rng(0).standard_normal(len(x))),
-        "depends_on_its_arguments_only",
-        "never uses its generator",
-        None,
-    ),
-    "nan": (
-        move(lambda rng, x, y: step(rng, x) * np.where(x > 0, 1, np.nan)),
-        "result_is_valid",
-        "becomes nan",
-        None,
-    ),
-    "fixed grid": (
-        proposal(lambda rng, y, n: np.linspace(-2, 2, n)),
-        "depends_on_its_arguments_only",
-        "never uses its generator",
-        None,
-    ),
-    "later rows": (
-        update(lambda rng, a, b, y: (p := union(a, b)).reweighted(0.1 * np.arange(len(p)))),
-        "order_of_particles_is_irrelevant",
-        "place in the array",
-        None,
-    ),
-}
-
-
-@pytest.mark.parametrize("name", NUMBERS)
-def test_faults_of_numbers_are_reported(name):
-    cls, law, words, exact = NUMBERS[name]
-    with pytest.raises(AssertionError, match=words):
-        run_property(cls(), law, exact)
-
-
-def test_a_component_that_never_draws_is_a_remark_or_a_false_statement():
-    fixed = move(lambda rng, x, y: 0.9 * x)()
-    results = {r.name: r for r in run_contract(fixed)}
-    assert results["depends_on_its_arguments_only"].failure is None
-    assert "draws = False" in results["depends_on_its_arguments_only"].remark
-
-    class Declares(type(fixed)):
-        draws = True
-
-    with pytest.raises(AssertionError, match="declares draws = True"):
-        run_property(Declares(), "depends_on_its_arguments_only")

@@ -9,7 +9,6 @@ import threading
 import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -23,7 +22,6 @@ from mstfilter.runs import RunFolder, filter_recording
 from mstfilter.runs.live import filter_folder
 from mstfilter.runs.presets import load_config
 from mstfilter.scene import Recording, encode_hypotheses, scene_cache
-from mstfilter.smc import Proposal
 from tests.formats.layouts import FPS, SHIFTS, video, write_redwood
 from tests.scene.scenes import CAMERA, GRID
 from tests.wrong_inputs import shifted_camera
@@ -59,7 +57,7 @@ def filtered(**more):
     return [state for state, _ in FAST.iterate(recording.clips(), 4)]
 
 
-@pytest.mark.parametrize("threads", [1, 2, 4, 8])
+@pytest.mark.parametrize("threads", [1, 4])
 def test_a_stream_has_the_results_of_the_recording(threads):
     states = filtered(pauses=RULE)
     scene_cache.clear()
@@ -110,7 +108,7 @@ def test_late_frames_and_frames_without_depth_are_dropped_and_counted():
     assert arrays(found[-1].state) == arrays(filtered(pauses=RULE)[-1])
 
 
-FAR = {"one stamp far ahead": 1e9, "one stamp ahead": 1e3, "one stamp in milliseconds": 1e12, "one old stamp": -50.0}
+FAR = {"one stamp far ahead": 1e9, "one stamp ahead": 1e3, "one old stamp": -50.0}
 
 
 @pytest.mark.parametrize("k", [0, 6])
@@ -317,23 +315,6 @@ def test_all_frames_have_poses_or_none():
             with pytest.raises(InputError, match=f"frame 1 has {'no' if second is None else 'a'} pose"):
                 stream.push(RGB[1], DEPTH[1], 1.0, pose=second)
             assert stream.push(RGB[1], DEPTH[1], 2.0, pose=first)
-
-
-def test_an_error_while_libraries_are_loaded_is_no_error_of_the_stream():
-    @dataclass(frozen=True)
-    class Fragile(Proposal):
-        inner: Proposal = FAST.proposal
-
-        def sample(self, rng, observation, n):
-            if observation.after.rgb.max() == 0:
-                raise ZeroDivisionError
-            return self.inner.sample(rng, observation, n)
-
-    with mstfilter.Stream(CAMERA.K, replace(FAST, proposal=Fragile()), pauses=None) as stream:
-        stream.push(np.zeros_like(RGB[0]), DEPTH[0], 0.0)
-        stream.push(RGB[0], DEPTH[0], 1.0, pause=True)
-        stream.wait()
-        assert stream.last.index == 0
 
 
 def test_a_recording_searches_the_pauses_in_the_images_that_a_stream_gets(tmp_path):
