@@ -216,6 +216,8 @@ _PACKAGES = {
     "rosbags": "'mstfilter[bags]'",
     "onnxruntime": "'mstfilter[onnx]'",
     "xarray": "'mstfilter[xarray]'",
+    "coacd": "'mstfilter[objects]'",
+    "trimesh": "'mstfilter[objects]'",
 }
 
 

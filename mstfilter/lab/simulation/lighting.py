@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mstfilter.lab.simulation.shapes import Shape
-from mstfilter.lab.simulation.textures import Atlas, Room, texture_coordinates
+from mstfilter.lab.simulation.textures import Atlas, Room, linear_light, texture_coordinates
 from mstfilter.lab.simulation.world import FINGER_GROUP, FINGER_ID, OBJECT_GROUP, PhysicsWorld
 
 SHADOW_GROUPS = (OBJECT_GROUP, FINGER_GROUP)  #: Geoms that cast shadows
@@ -124,6 +124,11 @@ class BodyColours:
 
     def __init__(self, stage: Stage, atlas: Atlas, room: Room, eye: np.ndarray) -> None:
         self._stage, self._atlas, self._room, self._eye = stage, atlas, room, eye
+        #: Of each surface of the world, the index of its first piece among the pieces of its body.
+        self._first_piece: list[int] = []
+        for shape in stage.world.shapes:
+            counts = [len(part.shape.pieces) for part in shape.surfaces]
+            self._first_piece += np.cumsum([0, *counts[:-1]]).tolist()
 
     def at(self, geom: np.ndarray, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """Linear colours (n, 3) float32 of points (n, 3) with normals (n, 3) on MuJoCo geoms (n,)."""
@@ -147,17 +152,31 @@ class BodyColours:
         albedo[instance == FINGER_ID] = _FINGER_COLOUR
         gloss = np.full(len(points), 0.25, np.float32)
         smooth = normal.copy()
-        for k in np.unique(instance[instance != FINGER_ID]) - 1:
-            shape: Shape = world.shapes[k]
-            on = np.flatnonzero(instance == k + 1)
-            turn = poses[k, :3, :3]
-            local = _rotate(points[on] - poses[k, :3, 3], turn.T)
+        surface_of = world.geom_surface[geom]
+        for s in np.unique(surface_of[surface_of >= 0]):
+            k, part = world.surfaces[s]
+            shape: Shape = part.shape
+            on = np.flatnonzero(surface_of == s)
+            turn, at = poses[k, :3, :3], poses[k, :3, 3]
+            if world.shapes[k].parts:
+                turn, at = turn @ part.rotation, at + turn @ part.position
+            local = _rotate(points[on] - at, turn.T)
             facing = _rotate(normal[on], turn.T)
-            plain = np.array([piece.plain for piece in shape.pieces])[world.geom_piece[geom[on]]]
-            chart, place = texture_coordinates(shape, local, facing, plain)
-            albedo[on] = self._atlas.colour(int(k), chart, place)
-            gloss[on] = self._atlas.gloss[k]
-            smooth[on] = _rotate(_round_off(shape, local, facing, plain), turn)
+            gloss[on] = self._atlas.gloss[s]
+            if shape.surface is not None:
+                cell = shape.surface.look_up(local / shape.scale, facing)
+                rounded = shape.surface.smooth(cell, facing)
+                if shape.surface.colours is not None:
+                    albedo[on] = linear_light(shape.surface.colours[cell])
+                else:
+                    chart, place = texture_coordinates(shape, local, facing, np.zeros(len(on), bool))
+                    albedo[on] = self._atlas.colour(int(s), chart, place)
+            else:
+                plain = np.array([p.plain for p in shape.pieces])[world.geom_piece[geom[on]] - self._first_piece[s]]
+                chart, place = texture_coordinates(shape, local, facing, plain)
+                albedo[on] = self._atlas.colour(int(s), chart, place)
+                rounded = _round_off(shape, local, facing, plain)
+            smooth[on] = _rotate(rounded, turn)
         return albedo, gloss, smooth
 
     def _light(self, instance: np.ndarray, points: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

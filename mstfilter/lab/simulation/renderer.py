@@ -53,7 +53,7 @@ class Renderer:
     ) -> None:
         self.room, self.camera = room, camera
         self.stage = Stage(world, tolerance)
-        atlas = Atlas(list(skins), visible_texel(camera))
+        atlas = Atlas([one for skin in skins for one in skin.surfaces], visible_texel(camera))
         turn = camera.pose.as_matrix()[:3, :3]
         self._eye = np.array(camera.position)
         self._rays = camera.rays().reshape(-1, 3) @ turn.T

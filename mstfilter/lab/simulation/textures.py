@@ -37,13 +37,20 @@ class Skin:
     """Texture of a body: flat images (h, w, 3) uint8, called charts, and the strength of the highlight, 0 .. 1.
 
     Charts show six faces (-x, +x, -y, +y, -z, +z) or side, top, bottom and inside. The last chart has one colour.
+    A body of several parts has a texture for each part.
     """
 
     charts: tuple[np.ndarray, ...]
     gloss: float
+    parts: tuple[Skin, ...] = ()
+
+    @property
+    def surfaces(self) -> tuple[Skin, ...]:
+        """The textures in the order of `Shape.surfaces`."""
+        return self.parts or (self,)
 
 
-def _linear(image: np.ndarray) -> np.ndarray:
+def linear_light(image: np.ndarray) -> np.ndarray:
     """Linear intensity 0 .. 1, float32, of an sRGB image."""
     value = image.astype(np.float32) / 255.0
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
@@ -163,7 +170,7 @@ class Atlas:
             texels.append(chart)
         self._height, self._width = np.array([chart.shape[:2] for chart in texels]).T
         self._first = np.cumsum([0, *(self._height * self._width)[:-1]])
-        self._texels = _linear(np.concatenate([chart.reshape(-1, 3) for chart in texels]))
+        self._texels = linear_light(np.concatenate([chart.reshape(-1, 3) for chart in texels]))
 
     def colour(self, skin: int, chart: np.ndarray, place: np.ndarray) -> np.ndarray:
         """Linear albedo (n, 3) float32 of a texture, interpolated at the coordinates `place` (n, 2)."""
@@ -213,7 +220,7 @@ def _table_top(rng: np.random.Generator, texel: float) -> np.ndarray:
 
 def draw_room(rng: np.random.Generator, texel: float) -> Room:
     """Draw the surroundings of a scene. `texel` is the pixel size of the table's texture in metres."""
-    table = _linear(_table_top(rng, texel))
+    table = linear_light(_table_top(rng, texel))
     side = -1.0 if rng.uniform() < 0.5 else 1.0
     centre = np.array([side * rng.uniform(0.35, 0.8), rng.uniform(-0.7, 0.1), rng.uniform(1.3, 1.7)])
     spread = rng.uniform(0.08, 0.14)
