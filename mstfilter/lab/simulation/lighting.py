@@ -130,8 +130,14 @@ class BodyColours:
             counts = [len(part.shape.pieces) for part in shape.surfaces]
             self._first_piece += np.cumsum([0, *counts[:-1]]).tolist()
 
-    def at(self, geom: np.ndarray, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """Linear colours (n, 3) float32 of points (n, 3) with normals (n, 3) on MuJoCo geoms (n,)."""
+    def at(
+        self, geom: np.ndarray, points: np.ndarray, normal: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Linear colours (n, 3) float32 of points (n, 3) with normals (n, 3) on MuJoCo geoms (n,).
+
+        Also returns the share of light that the points reflect (n,), and the strength of the highlight (n,) of a lamp
+        at the camera, 0 .. 1.
+        """
         room, instance = self._room, self._stage.world.geom_object[geom]
         albedo, gloss, smooth = self._materials(instance, geom, points, normal)
         # Highlight by Blinn and Phong: the normal against the half vector between eye and lamp.
@@ -141,7 +147,9 @@ class BodyColours:
         bounce = ((0.5 - 0.5 * smooth[:, 2]) * np.clip(points[:, 2] / 0.05, 0.35, 1)).astype(np.float32)
         lamp, sky = self._light(instance, (points + _LIFT * normal).astype(np.float32), smooth.astype(np.float32))
         reflected = bounce[:, None] * (np.float32(0.55 / 0.6) * room.rim)
-        return albedo * (lamp + sky + room.ambient + reflected) + (gloss * highlight)[:, None] * lamp
+        colour = albedo * (lamp + sky + room.ambient + reflected) + (gloss * highlight)[:, None] * lamp
+        mirror = np.clip(_dot(_unit(self._eye - points), smooth), 0, 1).astype(np.float32) ** 40
+        return colour, albedo.mean(axis=1), np.minimum(2.5 * gloss, 1.0) * mirror
 
     def _materials(
         self, instance: np.ndarray, geom: np.ndarray, points: np.ndarray, normal: np.ndarray

@@ -159,15 +159,14 @@ class ObjectSet:
 
 def find_folder(folder: str) -> Path:
     """The folder of meshes that a family names. Raises InputError if it does not exist."""
-    if not folder:
-        folder = os.environ.get("MSTFILTER_OBJECTS", "")
-    if not folder:
+    named = os.path.expandvars(folder)
+    if "$" in named or not named.strip():
         raise InputError(
             "the scene family needs a folder of meshes",
             "name it: mstfilter simulate FAMILY OUT --objects FOLDER, or objects=FOLDER in Python and study files",
-            "the environment variable MSTFILTER_OBJECTS is the default",
+            "or set the environment variable MSTFILTER_OBJECTS, in which m1, m2 and m3 look for it",
         )
-    path = Path(folder).expanduser()
+    path = Path(named).expanduser()
     if not path.is_dir():
         raise InputError(f"objects {path}: no such folder", f"expected a folder with files {', '.join(_ENDINGS)}")
     return path

@@ -28,6 +28,8 @@ class View:
     depth: np.ndarray  #: (H, W) float32 metres, z-depth of the first surface; NaN for none
     instance: np.ndarray  #: (H, W) uint8, 0 for the room, 1 .. n for objects, 255 for finger and arm
     slant: np.ndarray  #: (H, W) float32, cosine between the surface's normal and the ray
+    reflectance: np.ndarray  #: (H, W) float32, share of light that the surface reflects
+    shine: np.ndarray  #: (H, W) float32, strength of the highlight of a lamp at the camera, 0 .. 1
 
 
 def visible_texel(camera: Camera) -> float:
@@ -76,6 +78,7 @@ class Renderer:
         self._room_albedo = self._room_colours(geom, points, normal)
         self._on_table = (geom == 0) & (normal[:, 2] > 0.5)
         self._room_light = self._unshadowed_light(points, normal)
+        self._room_reflectance = self._room_albedo.mean(axis=1)
         self._table_xy = points[self._on_table, :2]
 
     def _slant(self, pixels: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -135,14 +138,16 @@ class Renderer:
         depth[hit], normal[hit] = z[hit], facing[hit]
         slant[hit] = self._slant(hit, facing[hit])
         points = self._eye + self._rays[hit] * z[hit, None]
-        colour[hit] = self._bodies.at(geom[hit], points, facing[hit])
+        reflectance, shine = self._room_reflectance.copy(), np.zeros(h * w, np.float32)
+        colour[hit], reflectance[hit], shine[hit] = self._bodies.at(geom[hit], points, facing[hit])
         if self._further:
             edge = _edge_pixels(instance.reshape(h, w), normal.reshape(h, w, 3))
             total = np.zeros((len(edge), 3), np.float32)
             for rays in self._further:
                 total += self._colours(rays[edge])
             colour[edge] = (colour[edge] + total) / np.float32(1 + len(self._further))
-        return View(colour.reshape(h, w, 3), depth.reshape(h, w), instance.reshape(h, w), slant.reshape(h, w))
+        images = (image.reshape(h, w) for image in (depth, instance, slant, reflectance, shine))
+        return View(colour.reshape(h, w, 3), *images)
 
     def _colours(self, rays: np.ndarray) -> np.ndarray:
         """Colours (k, 3) of the surfaces that rays (k, 3) hit."""
@@ -150,7 +155,7 @@ class Renderer:
         points = self._eye + rays * z[:, None]
         result = np.empty((len(rays), 3), np.float32)
         body = (geom >= 0) & (self.stage.world.geom_object[geom] > 0)
-        result[body] = self._bodies.at(geom[body], points[body], normal[body])
+        result[body] = self._bodies.at(geom[body], points[body], normal[body])[0]
         geom, points, normal = geom[~body], points[~body], normal[~body]
         albedo, light = self._room_colours(geom, points, normal), self._unshadowed_light(points, normal)
         table = (geom == 0) & (normal[:, 2] > 0.5)

@@ -27,7 +27,8 @@ as a pack of cans.
 
 Across a plane wall of any thickness, the second rule gives a layer of one voxel, so a thin wall has no holes, and solid
 objects keep their volume. The inside of a mesh is a matter of the parity of rays (`surfaces`). No wall of the objects
-below is thinner than 0.7 voxels of 1 cm, so there the first rule decides.
+that are made of pieces is thinner than 0.7 voxels of 1 cm, so for them the first rule decides, and the second is not
+evaluated. With larger voxels, the walls of bowls and mugs may have holes.
 
 >>> from mstfilter.scene import VoxelGrid
 >>> from mstfilter.lab.simulation.shapes import label_voxels
@@ -58,7 +59,6 @@ _N_HUES = 12
 _MARGIN = 0.04  # share of a band that is left free at either side
 
 _THIN = 0.7  # a wall is thin where no cube of the size of a voxel is filled to this share
-_THINNEST = 0.007  # thickness of the thinnest wall of an object that is made of pieces (the slanted wall of a bowl), metres
 _FINE = 4  # points a voxel and axis, for shares of volume
 _WALL = 0.010  # thickness of the walls of bowl and mug, metres
 
@@ -241,7 +241,7 @@ def label_voxels(shapes: Sequence[Shape], poses: np.ndarray, grid: VoxelGrid) ->
                 continue
             block = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
             labels[block][(labels[block] == 0) & _centres_inside(part.shape, turn, at, grid, low, high)] = k + 1
-            if part.shape.surface is not None or _THIN * grid.voxel_size > _THINNEST + 1e-9:
+            if part.shape.surface is not None:
                 thin.append((block, _thin_walls(part.shape, turn, at, grid, low, high), k))
     for block, walls, k in thin:
         labels[block][(labels[block] == 0) & walls] = k + 1
@@ -405,6 +405,22 @@ def _banana(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
     thick = 0.018 * np.array([0.62, 0.88, 1.0, 1.0, 1.0, 0.88, 0.62])
     pieces = [capsule(a, b, r) for a, b, r in zip(path, path[1:], thick, strict=False)]
     return Shape("banana", "banana", pieces, 0.12, "box", ((_UP_Z, 1.0),), ("peel",), rolling=0.002)
+
+
+def board(rng: np.random.Generator) -> Shape:
+    """A cutting board."""
+    half = (float(rng.uniform(0.14, 0.19)), float(rng.uniform(0.10, 0.13)), float(rng.uniform(0.006, 0.011)))
+    return Shape("board", "board", [box(half)], 5000 * float(np.prod(half)), "box", ((_UP_Z, 1.0),), ("wood", "plain"))
+
+
+def tray(rng: np.random.Generator) -> Shape:
+    """A tray with a rim."""
+    x, y, z = float(rng.uniform(0.15, 0.20)), float(rng.uniform(0.11, 0.14)), float(rng.uniform(0.014, 0.022))
+    wall = 0.005  # half of the thickness of floor and rim, metres
+    pieces = [box((x, y, wall), (0, 0, wall))]
+    pieces += [box((x, wall, z - wall), (0, s * (y - wall), z + wall)) for s in (-1, 1)]
+    pieces += [box((wall, y - 2 * wall, z - wall), (s * (x - wall), 0, z + wall)) for s in (-1, 1)]
+    return Shape("tray", "tray", pieces, 0.7, "box", ((_UP_Z, 1.0),), ("wood", "plain"))
 
 
 _MAKERS: dict[str, Callable[[np.random.Generator, Callable[[], float]], Shape]] = {

@@ -207,6 +207,38 @@ class Surface:
         return float(self.inside.share.sum(dtype=np.float64)) * self.inside.cell**3
 
     @functools.cached_property
+    def centre_of_mass(self) -> np.ndarray:
+        """Middle (3,) of the volume, metres."""
+        share = self.inside.share.astype(np.float64)
+        total = share.sum()
+        sums = [(share.sum(axis=tuple(b for b in range(3) if b != a)) @ np.arange(share.shape[a])) for a in range(3)]
+        return np.asarray(self.inside.origin + self.inside.cell * (np.array(sums) / total + 0.5))
+
+    @functools.cached_property
+    def stances(self) -> tuple[tuple[np.ndarray, float], ...]:
+        """Directions (3,) that can point up at rest, and the tangent of the angle by which each can be tilted."""
+        from scipy.spatial import ConvexHull, QhullError
+
+        hull = ConvexHull(self.vertices)
+        corners = self.vertices[hull.vertices]
+        _, first = np.unique(np.rint(hull.equations[:, :3] / 0.05), axis=0, return_index=True)
+        found = []
+        for normal in hull.equations[first, :3]:
+            along = corners @ normal
+            x = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
+            x /= np.linalg.norm(x)
+            plane = np.stack([x, np.cross(normal, x)])
+            foot = corners[along > along.max() - 0.001] @ plane.T - plane @ self.centre_of_mass
+            try:
+                edge = float(-ConvexHull(foot).equations[:, 2].max())  # distance of the centre of mass from the edges
+            except (QhullError, ValueError):
+                continue
+            tilt = edge / max(float(along.max() - normal @ self.centre_of_mass), 1e-4)
+            if tilt > 0.1:
+                found.append((-normal, tilt))
+        return tuple(found)
+
+    @functools.cached_property
     def pieces(self) -> tuple[Piece, ...]:
         """The convex pieces."""
         return tuple(hull(corners) for corners in self.hulls)

@@ -111,7 +111,7 @@ def draw_skin(rng: np.random.Generator, shape: Shape, pool: Pool = ANY) -> Skin:
     sizes = _chart_sizes(shape)
     pair = (printing.shade(rng, pool=pool), printing.shade(rng, (0.55, 0.95), 0.65, pool))
     words = printing.brand(rng, pool)
-    gloss = {"label": 0.30, "ceramic": 0.35, "carton": 0.12}.get(style, 0.04)
+    gloss = {"label": 0.30, "ceramic": 0.35, "carton": 0.12, "plain": 0.15, "metal": 0.40}.get(style, 0.04)
     if style == "carton":
         # Front and back are on the two broadest upright faces, the sides on the narrow ones.
         wide = sorted(range(4), key=lambda k: -sizes[k][0])[:2]
@@ -141,6 +141,13 @@ def draw_skin(rng: np.random.Generator, shape: Shape, pool: Pool = ANY) -> Skin:
         for w, h in sizes:
             rng.bit_generator.state = state  # every face has the same weave
             charts.append(printing.cloth(rng, w, h, pool))
+    elif style == "plain":
+        # Handles, toys and tools: dark tones are as frequent as light ones.
+        tone = printing.shade(rng, (0.08, 0.5) if rng.uniform() < 0.5 else (0.4, 0.95), 0.8, pool)
+        charts = [printing.plastic(rng, w, h, tone) for w, h in sizes]
+    elif style == "metal":
+        grey = int(rng.uniform(95, 175))
+        charts = [printing.metal(rng, w, h, grey) for w, h in sizes]
     elif style == "peel":
         ripe = (int(rng.uniform(205, 228)), int(rng.uniform(175, 195)), int(rng.uniform(60, 95)))
         charts = [printing.peel(rng, w, h, ripe) for w, h in sizes]
@@ -151,6 +158,26 @@ def draw_skin(rng: np.random.Generator, shape: Shape, pool: Pool = ANY) -> Skin:
     colour = charts[_INSIDE][0, 0] if style == "ceramic" else charts[0].reshape(-1, 3).mean(axis=0)
     plain = np.broadcast_to(colour.astype(np.uint8), (2, 2, 3))
     return Skin((*charts, plain), gloss)
+
+
+def sliced(skin: Skin, axis: int, n: int) -> list[Skin]:
+    """The texture of a box cut into n boxes of equal length along a body axis, from the lowest to the highest.
+
+    The cut faces have the textures of the ends.
+    """
+    pieces: list[list[np.ndarray]] = [[] for _ in range(n)]
+    for face in range(6):
+        right, up = _face_axes(face)
+        chart = skin.charts[face]
+        if face // 2 == axis:
+            parts = [chart] * n
+        elif right[axis]:
+            parts = np.array_split(chart, n, axis=1)[:: int(np.sign(right[axis]))]
+        else:
+            parts = np.array_split(chart, n, axis=0)[:: -int(np.sign(up[axis]))]
+        for piece, part in zip(pieces, parts, strict=True):
+            piece.append(np.ascontiguousarray(part))
+    return [Skin((*charts, skin.charts[-1]), skin.gloss) for charts in pieces]
 
 
 class Atlas:
