@@ -15,13 +15,18 @@ A scene can also be simulated step by step:
 
 With a `PushLoop`, a program chooses each push from the belief of a filter.
 
-The lower modules, from bottom to top, are `solids` and `shapes` (objects), `families` (parameters of scenes), `world`
-(MuJoCo physics, pushes), `printing` and `textures` (appearance). The higher modules are `arrangement` (placement),
-`lighting` and `renderer` (ray casting), `sensor` (noise), `recorder` (recordings and their cache) and `push_loop`.
+Objects are generated, or they are meshes of your own:
 
-The simulation has no camera motion, no glossy or transparent surfaces, no light reflected between objects, no
-articulated or soft objects, and no hand. Depth noise, the shadow of the projector and missing readings at edges are
-calibrated to real frames. Within a surface, depth noise is not correlated between pixels.
+>>> simulate_recording(replace(scene_family("s1"), objects="my_objects"), 7, "recordings/mine-7")  # doctest: +SKIP
+
+The lower modules, from bottom to top, are `solids`, `surfaces` and `shapes` (objects), `objects` (folders of meshes),
+`sensor` (noise), `families` (parameters of scenes), `world` (MuJoCo physics, pushes), `printing` and `textures`
+(appearance). The higher modules are `groups` (objects that stand together), `arrangement` (placement), `lighting` and
+`renderer` (ray casting), `recorder` (recordings and their cache) and `push_loop`.
+
+The simulation has no camera motion, no transparent surfaces, no mirror images, no light reflected between objects, no
+articulated or soft objects, and no hand. Depth noise, the shadow of the projector and missing readings at edges of the
+default sensor are calibrated to real frames; other sensors follow published figures.
 """
 
 from mstfilter.base.lazy import attach

@@ -14,7 +14,7 @@ import numpy as np
 
 from mstfilter.base.errors import InputError
 from mstfilter.lab.simulation.families import SceneFamily
-from mstfilter.lab.simulation.groups import Group, about_z, draw_group, draw_thing
+from mstfilter.lab.simulation.groups import Group, about_z, draw_group
 from mstfilter.lab.simulation.objects import MeshPool
 from mstfilter.lab.simulation.shapes import Pool, Shape, board, draw_shape, tray
 from mstfilter.lab.simulation.surfaces import Surface
@@ -45,7 +45,9 @@ class SceneObjects:
     wall: Wall | None = None
 
 
-def draw_objects(rng: np.random.Generator, family: SceneFamily, pool: Pool, mesh_pool: MeshPool = "all") -> SceneObjects:
+def draw_objects(
+    rng: np.random.Generator, family: SceneFamily, pool: Pool, mesh_pool: MeshPool = "all"
+) -> SceneObjects:
     """Draw the shapes and textures of a scene, from all families of objects. Most frequent are cartons and cans.
 
     Objects are meshes of `mesh_pool` if the family has a folder of meshes.
@@ -76,7 +78,7 @@ def draw_objects(rng: np.random.Generator, family: SceneFamily, pool: Pool, mesh
     bag: list[str] = []
     while len(shapes) - others < count - family.n_twins - family.n_groups:
         if meshes is not None and rng.uniform() < family.mesh_share:
-            shape = draw_thing(rng, meshes, mesh_pool)
+            shape = meshes.draw(rng, mesh_pool, but=tuple(s.name for s in shapes))
         else:
             if not bag:
                 # Cartons and cans, which are common on tables, are more frequent.
@@ -94,9 +96,7 @@ def draw_objects(rng: np.random.Generator, family: SceneFamily, pool: Pool, mesh
         shapes.append(shapes[original])
         skins.append(skins[original])
         twin_of.append(original)
-    return SceneObjects(
-        tuple(shapes), tuple(skins), tuple(twin_of), tuple(groups), family.n_dropped, base, wall
-    )
+    return SceneObjects(tuple(shapes), tuple(skins), tuple(twin_of), tuple(groups), family.n_dropped, base, wall)
 
 
 def _draw_wall(rng: np.random.Generator) -> Wall:
@@ -381,7 +381,7 @@ def _try_arrangement(
                 return False
         placed.append(k)
     world.forward()
-    if not (world.settle() or (objects.n_dropped and world.settle())):
+    if not world.settle(placed):
         return False
     if dropped:
         for k in dropped:

@@ -116,7 +116,9 @@ class SceneFamily(Bounded):
         check_integer("n_groups", self.n_groups, at_least=0, at_most=self.n_objects_min)
         check_integer("n_dropped", self.n_dropped, at_least=0, at_most=self.n_objects_min - 1)
         if self.n_groups and not self.groups:
-            raise InputError(f"scene family {self.name!r}: {self.n_groups} groups of no kind", "groups=row, stack or pack")
+            raise InputError(
+                f"scene family {self.name!r}: {self.n_groups} groups of no kind", "groups=row, stack or pack"
+            )
         self.aims()
         self.shape_families()
         if self.n_actions and self.action_seconds < 1.0:

@@ -21,8 +21,10 @@ others (or, if the group is one, the whole), "together" moves all parts as one b
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -33,6 +35,7 @@ from mstfilter.lab.simulation.shapes import Part, Pool, Shape, draw_shape
 from mstfilter.lab.simulation.solids import box
 from mstfilter.lab.simulation.textures import Skin, draw_skin, sliced
 from mstfilter.lab.simulation.world import FingerPush, PhysicsWorld, draw_push, is_clear, play_push
+from mstfilter.scene import Recording
 
 _OFFSET, _TURN, _GAP = 0.01, np.deg2rad(5.0), 0.002  # largest errors of setting down by hand
 _APART, _STILL = 0.010, 0.001  # metres: parts moved apart; nothing moved
@@ -109,17 +112,12 @@ class Group:
         return {"kind": self.kind, "one": self.one, "objects": [k + 1 for k in self.objects], "parts": described}
 
 
-def draw_thing(
-    rng: np.random.Generator, meshes: ObjectSet, pool: MeshPool, kinds: tuple[str, ...] = ()
-) -> Shape:
-    """The shape of a random mesh of a pool."""
-    return meshes.draw(rng, pool, kinds)
-
-
 def _book(rng: np.random.Generator, pool: Pool) -> Shape:
     half = np.array([float(rng.uniform(0.010, 0.034)), 0.065 * pool.factor(rng), 0.10 * pool.factor(rng)]) / (2, 1, 1)
     mass = 700.0 * 8 * float(np.prod(half))
-    return Shape("book", "book", [box((half[0], half[1], half[2]))], mass, "box", ((1, 0.6), (2, 0.2), (3, 0.2)), ("carton",))
+    return Shape(
+        "book", "book", [box((half[0], half[1], half[2]))], mass, "box", ((1, 0.6), (2, 0.2), (3, 0.2)), ("carton",)
+    )
 
 
 def _small_box(rng: np.random.Generator, pool: Pool) -> Shape:
@@ -130,10 +128,15 @@ def _small_box(rng: np.random.Generator, pool: Pool) -> Shape:
 
 
 def _draw_part(
-    rng: np.random.Generator, family: SceneFamily, pool: Pool, meshes: ObjectSet | None, mesh_pool: MeshPool, kind: str
+    rng: np.random.Generator,
+    family: SceneFamily,
+    pool: Pool,
+    meshes: ObjectSet | None,
+    mesh_pool: MeshPool,
+    kind: str,
 ) -> Shape:
     if meshes is not None and rng.uniform() < family.mesh_share:
-        return draw_thing(rng, meshes, mesh_pool, _UPRIGHT_KINDS)
+        return meshes.draw(rng, mesh_pool, _UPRIGHT_KINDS)
     if kind == "book":
         return _book(rng, pool)
     if kind == "box":
@@ -285,14 +288,42 @@ def _pack(rng: np.random.Generator, draw: Callable[[str], Shape], pool: Pool, on
     step = 2 * half[:2] + (0.0 if one else 0.0003)
     for i in range(columns):
         for j in range(rows):
-            at, angle = step * (i, j), 0.0
+            at = step * (i, j)
             if not one:
                 at = at + (i, j) * rng.uniform(0, _GAP, 2)
-                angle = float(rng.uniform(0, 2 * np.pi)) if shape.family in ("can", "bottle") else 0.0
+            angle = float(rng.uniform(0, 2 * np.pi)) if shape.family in ("can", "bottle") else 0.0
             spin = about_z(angle)
             parts.append(Part(shape, spin @ turn, np.array([*at, half[2]])))
             skins.append(skin if alike else draw_skin(rng, shape, pool))
     return parts, skins
+
+
+def part_image(recording: Recording, frame: int) -> np.ndarray:
+    """Which part each pixel of a frame shows (H, W) uint16: 1, 2, ... in the order of the groups and their parts.
+
+    Parts of one body are told apart by their places in the manifest. Pixels without a group, and pixels of a group
+    without a depth reading, are 0. With this image, the probability that two parts are one object can be asked of a
+    filter, whether they are or not.
+    """
+    instance, image = recording.instance(frame), recording.frames[frame]
+    poses = json.loads((Path(recording.path) / "poses.json").read_text(encoding="utf-8"))[frame]["T_world_object"]
+    points = image.camera.unproject(image.depth)
+    found = np.zeros(instance.shape, np.uint16)
+    number = 0
+    for group in recording.manifest.get("groups", []):
+        best = np.full(instance.shape, np.inf)
+        for part in group["parts"]:
+            number += 1
+            pose = np.array(poses[str(part["object"])])
+            turn = pose[:3, :3] @ np.array(part["rotation"])
+            at = pose[:3, :3] @ part["position_m"] + pose[:3, 3]
+            with np.errstate(invalid="ignore"):
+                outside = np.abs((points - at) @ turn) - part["half_m"]
+                distance = outside.max(axis=-1)
+                nearer = (instance == part["object"]) & (distance < best)
+            best[nearer] = distance[nearer]
+            found[nearer] = number
+    return found
 
 
 def choose_group_push(

@@ -143,10 +143,20 @@ class ObjectSet:
             )
         return found
 
-    def draw(self, rng: np.random.Generator, pool: MeshPool, kinds: tuple[str, ...] = ()) -> Shape:
-        """The shape of a random object of a pool, of one of `kinds` if there is one."""
+    def draw(
+        self,
+        rng: np.random.Generator,
+        pool: MeshPool,
+        kinds: tuple[str, ...] = (),
+        but: tuple[str, ...] = (),
+    ) -> Shape:
+        """The shape of a random object of a pool, of one of `kinds` if there is one.
+
+        Objects with the names `but` are not drawn as long as there are others.
+        """
         objects = self.of_pool(pool)
         objects = tuple(one for one in objects if one.kind in kinds) or objects
+        objects = tuple(one for one in objects if one.name not in but) or objects
         if not self.indexed:
             return objects[int(rng.integers(len(objects)))].shape(1.0)
         sources = sorted({one.source for one in objects})
@@ -239,7 +249,9 @@ def _of_file(path: Path, index: Mapping[str, Mapping[str, str]], scale: float, u
 def _checked(name: str, where: str, triangles: Triangles, scale: float) -> MeshObject:
     """The object of a mesh. Raises InputError if the mesh is empty, broken or not of the size of objects."""
     if not len(triangles.faces):
-        raise InputError(f"object {where}: the mesh has no faces", "points alone are no object: make a surface of them")
+        raise InputError(
+            f"object {where}: the mesh has no faces", "points alone are no object: make a surface of them"
+        )
     if len(triangles.faces) > _MOST_FACES:
         raise InputError(
             f"object {where}: the mesh has {len(triangles.faces):,} faces, at most {_MOST_FACES:,} are used",

@@ -150,7 +150,7 @@ class Shape:
         """The shape of a mesh, `scale` times as large as the mesh."""
         pieces = tuple(placed(piece, np.eye(3), np.zeros(3), scale) for piece in surface.pieces)
         print_as = "lathe" if finish[0] in ("label", "ceramic") else "box"
-        rolling = 0.002
+        rolling = 0.004
         return cls(family, name, pieces, mass, print_as, ((_UP_Z, 1.0),), finish, rolling, surface, scale)
 
     @classmethod
@@ -410,7 +410,9 @@ def _banana(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
 def board(rng: np.random.Generator) -> Shape:
     """A cutting board."""
     half = (float(rng.uniform(0.14, 0.19)), float(rng.uniform(0.10, 0.13)), float(rng.uniform(0.006, 0.011)))
-    return Shape("board", "board", [box(half)], 5000 * float(np.prod(half)), "box", ((_UP_Z, 1.0),), ("wood", "plain"))
+    return Shape(
+        "board", "board", [box(half)], 5000 * float(np.prod(half)), "box", ((_UP_Z, 1.0),), ("wood", "plain")
+    )
 
 
 def tray(rng: np.random.Generator) -> Shape:

@@ -377,8 +377,10 @@ def _convex_pieces(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
         seed=0,
     )
     # The clipping of pieces leaves some that are nearly flat, which a physics engine cannot use.
-    solid = [corners for corners, _ in parts if _is_solid(np.asarray(corners))]
-    return tuple(np.asarray(corners) for corners in solid) or (vertices,)
+    # Pieces may reach a few millimetres beyond the mesh; within its bounding box, the mesh stands on the table itself.
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    pieces = [np.clip(np.asarray(corners), low, high) for corners, _ in parts]
+    return tuple(corners for corners in pieces if _is_solid(corners)) or (vertices,)
 
 
 def _is_solid(corners: np.ndarray) -> bool:

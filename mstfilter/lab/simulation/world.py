@@ -127,9 +127,13 @@ def _model_xml(shapes: Sequence[Shape], arm: bool, wall: Wall | None) -> str:
     motors = "".join(f'<position joint="{a}" kp="2500" kv="70.710678"/>' for a in "xyz")
     half, middle = TABLE
     room = f'group="{ROOM_GROUP}"'
-    near = "" if wall is None else (
-        f'<geom type="box" size="{_numbers(wall.half)}" pos="{_numbers(wall.centre)}" {room} condim="4" '
-        f'friction="0.5 0.01 0.0005"/>'
+    near = (
+        ""
+        if wall is None
+        else (
+            f'<geom type="box" size="{_numbers(wall.half)}" pos="{_numbers(wall.centre)}" {room} condim="4" '
+            f'friction="0.5 0.01 0.0005"/>'
+        )
     )
     return f"""<mujoco>
 <compiler angle="radian"/>
@@ -182,7 +186,9 @@ class PhysicsWorld:
         self.geom_piece: np.ndarray = np.arange(self.model.ngeom) - self.model.body_geomadr[self.model.geom_bodyid]
         #: The shapes with textures of their own, as pairs of object and part, and for each geom the index of its pair
         #: (-1 for room, finger and arm).
-        self.surfaces: tuple[tuple[int, Part], ...] = tuple((k, part) for k, s in enumerate(shapes) for part in s.surfaces)
+        self.surfaces: tuple[tuple[int, Part], ...] = tuple(
+            (k, part) for k, s in enumerate(shapes) for part in s.surfaces
+        )
         self.geom_surface: np.ndarray = np.full(self.model.ngeom, -1)
         self._meshes = np.zeros(self.model.ngeom, bool)
         first = 0
@@ -253,12 +259,16 @@ class PhysicsWorld:
         """Advance by n time steps of 2 ms."""
         self._mj.mj_step(self.model, self.data, n)
 
-    def settle(self) -> bool:
-        """Run until no object moves faster than 0.01 m/s or rad/s for 0.1 s. Returns False after 4 s of motion."""
+    def settle(self, only: Sequence[int] | None = None) -> bool:
+        """Run until no object moves faster than 0.01 m/s or rad/s for 0.1 s. Returns False after 4 s of motion.
+
+        `only` has the objects that count, if others are not placed yet.
+        """
+        index = self._velocity_index if only is None else self._velocity_index[list(only)]
         calm = 0
         for _ in range(200):
             self.step(10)
-            calm = calm + 1 if np.abs(self.data.qvel[self._velocity_index]).max() < 0.01 else 0
+            calm = calm + 1 if np.abs(self.data.qvel[index]).max() < 0.01 else 0
             if calm >= 5:
                 break
         self.forward()

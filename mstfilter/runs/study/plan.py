@@ -146,8 +146,10 @@ def _scenes(entry: SceneEntry, folder: Path) -> Iterator[StudyScene]:
         from mstfilter.lab.simulation import recipe_key, scene_family
 
         family = scene_family(entry.family)
-        family = REGISTRY.make(type(family), entry.set, f"scene family {entry.family!r}", base=family)
-        changed = {name: getattr(family, name) for name in entry.set}
+        named = {"objects": str((folder / entry.objects).resolve())} if entry.objects else {}
+        values = {**entry.set, **named}
+        family = REGISTRY.make(type(family), values, f"scene family {entry.family!r}", base=family)
+        changed = {name: getattr(family, name) for name in values}
         for seed in entry.seeds:
             source = {"family": entry.family, "seed": seed, "set": changed}
             yield StudyScene(f"{entry.group_name}-{seed}", entry.group_name, source, recipe_key(family, seed))
