@@ -25,8 +25,8 @@ The lower modules, from bottom to top, are `solids`, `surfaces` and `shapes` (ob
 `renderer` (ray casting), `recorder` (recordings and their cache) and `push_loop`.
 
 The simulation has no camera motion, no transparent surfaces, no mirror images, no light reflected between objects, no
-articulated or soft objects, and no hand. Depth noise, the shadow of the projector and missing readings at edges of the
-default sensor are calibrated to real frames; other sensors follow published figures.
+articulated or soft objects, and no hand. Depth noise, the shadow of the projector and missing readings at edges of
+the default sensor are calibrated to real frames; other sensors follow published figures.
 """
 
 from mstfilter.base.lazy import attach

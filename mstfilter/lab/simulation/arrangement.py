@@ -1,8 +1,8 @@
 """Placement of objects on the table: clusters, pairs of touching identical objects (twins), stacks, hidden objects.
 
 Each object is moved towards the cluster until the object nearly touches another object. The position is found by
-bisection with MuJoCo's contact test. After placement, the physics runs until all objects are at rest. Groups of objects
-(`groups`) are placed first, as they stand.
+bisection with MuJoCo's contact test. After placement, the physics runs until all objects are at rest. Groups of
+objects (`groups`) are placed first, as they stand.
 """
 
 from __future__ import annotations
@@ -362,10 +362,10 @@ def _try_arrangement(
         placed += group.objects
     for k in order:
         pose: _RestPose = "tall" if k in tall else "any"
-        if objects.base and k not in hidden and twin_of[k] < 0 and rng.uniform() < 0.6:
-            if _put_on_base(rng, world, k, 0):
-                placed.append(k)
-                continue
+        on_base = objects.base and k not in hidden and twin_of[k] < 0 and rng.uniform() < 0.6
+        if on_base and _put_on_base(rng, world, k, 0):
+            placed.append(k)
+            continue
         if not placed:
             rotation, height = _draw_rest_pose(rng, world.shapes[k], pose)
             world.place(k, (*(_CENTRE + rng.uniform(-0.05, 0.05, 2)), height + 0.0002), rotation)

@@ -9,12 +9,12 @@ and the studies use the names in `SCENE_FAMILIES`. New kinds of objects are adde
 studies use `s1`, `s2` and `s3` with 5, 9 and 15 to 20 objects and the same camera, sensor and textures. The field
 `catalogue` separates scenes for tuning from scenes for reporting. In `s1` to `s3`, the seed determines the catalogue.
 
-`m1`, `m2` and `m3` are like `s1` to `s3` with meshes of real objects (`objects`). The seed also determines the pool of
-meshes: below 1000 tuning, from 1000 on reported. Networks are trained on scenes with ``mesh_pool="training"``.
+`m1`, `m2` and `m3` are like `s1` to `s3` with meshes of real objects (`objects`). The seed also determines the pool
+of meshes: below 1000 tuning, from 1000 on reported. Networks are trained on scenes with ``mesh_pool="training"``.
 
-In `row`, `stack` and `pack`, some things are several objects that touch, and some are one object that looks like several:
-a box with two prints, a pack of cans, a body of two parts. `one_share` is the share of the latter, and `push_aims` says
-whether a push moves one object of a group, moves the group as one body, or leaves all groups alone.
+In `row`, `stack` and `pack`, some things are several objects that touch, and some are one object that looks like
+several: a box with two prints, a pack of cans, a body of two parts. `one_share` is the share of the latter, and
+`push_aims` says whether a push moves one object of a group, moves the group as one body, or leaves all groups alone.
 """
 
 from __future__ import annotations
@@ -105,8 +105,8 @@ class SceneFamily(Bounded):
     groups: Literal["", "row", "stack", "pack"] = ""  #: how the objects of a group stand
     n_groups: NonNegativeInt = 0  #: groups of objects; the other objects are alone
     one_share: Share = 0.5  #: probability that a group is one object that looks like several
-    #: What pushes do to groups, separated by commas: `apart`, `together`, `nothing`. Each push draws one. Empty: pushes
-    #: do not heed groups.
+    #: What pushes do to groups, separated by commas: `apart`, `together`, `nothing`. Each push draws one. Empty:
+    #: pushes do not heed groups.
     push_aims: str = ""
 
     def __post_init__(self) -> None:
@@ -178,7 +178,7 @@ class SceneFamily(Bounded):
         return self.mesh_pool
 
     def described(self) -> dict[str, Any]:
-        """The fields, without later additions that have their default. A folder of objects is its name and content."""
+        """The fields, without later additions at their defaults. A folder of objects is its name and content."""
         names = [f.name for f in fields(self)]
         added = names[names.index(_FIRST_ADDED) :]
         default = {f.name: f.default for f in fields(self)}

@@ -1,9 +1,10 @@
 """Groups: objects that stand together by hand, and bodies that look like several objects.
 
-A group is a row (side by side), a stack (one on another) or a pack (a grid of equal things). What it looks like is drawn
-first: two to six parts, equal or different. Then it is either *one*: a rigid body of all parts without gaps, such as a box
-with two prints, a pack of cans or an object of two parts; or each part is an object, set down by hand: offset by up to
-1 cm, turned by up to 5 degrees, with gaps of up to 2 mm. The parameter `one_share` of a family is the probability of one.
+A group is a row (side by side), a stack (one on another) or a pack (a grid of equal things). What it looks like is
+drawn first: two to six parts, equal or different. Then it is either *one*: a rigid body of all parts without gaps,
+such as a box with two prints, a pack of cans or an object of two parts; or each part is an object, set down by hand:
+offset by up to 1 cm, turned by up to 5 degrees, with gaps of up to 2 mm. The parameter `one_share` of a family is the
+probability of one.
 
 >>> import numpy as np
 >>> from dataclasses import replace
@@ -24,6 +25,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -78,7 +80,7 @@ class Group:
         return [(self.objects[0], np.eye(3), self.parts[0].position - self._body().parts[0].position)]
 
     def part_poses(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rotations (m, 3, 3) and positions (m, 3) of the parts in the world, from the poses (n, 4, 4) of all objects."""
+        """Rotations (m, 3, 3) and positions (m, 3) of the parts in the world, from poses (n, 4, 4) of all objects."""
         if not self.one:
             own = poses[list(self.objects)]
             return own[:, :3, :3], own[:, :3, 3]
@@ -88,7 +90,7 @@ class Group:
 
     def stands(self, poses: np.ndarray) -> bool:
         """Whether the parts are still within 8 mm of where they stood to each other, and upright."""
-        turns, at = self.part_poses(poses)
+        _, at = self.part_poses(poses)
         meant = np.array([part.position for part in self.parts])
         distance = np.linalg.norm(at[:, None] - at[None], axis=2)
         planned = np.linalg.norm(meant[:, None] - meant[None], axis=2)
@@ -259,7 +261,7 @@ def _stack(rng: np.random.Generator, draw: Callable[[str], Shape], pool: Pool, o
         order = sorted(range(n), key=lambda k: -float(sizes[k][0] * sizes[k][1]))
         if len({id(shape) for shape in look.shapes}) == 1:
             order = list(range(n))
-        wide = all((sizes[b][:2] <= sizes[a][:2] * 1.15).all() for a, b in zip(order, order[1:], strict=False))
+        wide = all((sizes[b][:2] <= sizes[a][:2] * 1.15).all() for a, b in pairwise(order))
         slender = sum(s[2] for s in sizes) / min(float(s[:2].min()) for s in sizes)
         if wide and slender < 6 and 2 * sum(s[2] for s in sizes) < _HIGHEST:
             break
@@ -352,7 +354,8 @@ def choose_group_push(
             fallback = push
     if fallback is None:
         raise InputError(
-            f"scene family {family.name!r}: none of {4 * family.n_candidates} pushes moves an object without dropping one",
+            f"scene family {family.name!r}: none of {4 * family.n_candidates} pushes moves an object "
+            "without dropping one",
             "raise push_speed, frames_per_clip or n_candidates",
         )
     return fallback

@@ -4,10 +4,10 @@
 >>> objects = open_objects("my_objects")  # doctest: +SKIP
 >>> shape = objects.draw(np.random.default_rng(0), "all")  # doctest: +SKIP
 
-A folder has files ``.obj``, ``.glb``, ``.gltf``, ``.stl`` and ``.ply``, each with one object, or a table ``index.csv``
-with ``.npz`` archives (`_read_archives`). Sizes are true sizes in metres, and z points up; glTF files have y up, as
-their standard says. `SceneFamily.object_scale` and `object_up` change both. Colours come from textures, or from
-colours of vertices or faces. An object without colours gets a drawn texture.
+A folder has files ``.obj``, ``.glb``, ``.gltf``, ``.stl`` and ``.ply``, each with one object, or a table
+``index.csv`` with ``.npz`` archives (`_read_archives`). Sizes are true sizes in metres, and z points up; glTF files
+have y up, as their standard says. `SceneFamily.object_scale` and `object_up` change both. Colours come from textures,
+or from colours of vertices or faces. An object without colours gets a drawn texture.
 
 A table ``index.csv`` may also describe files: the column ``id`` has their names without ending, ``class`` one of
 `CLASSES` and ``stem`` a name that near duplicates share.
@@ -63,7 +63,7 @@ _FINISHES: Mapping[str, tuple[str, ...]] = {
 
 
 def pool_of(source: str, stem: str) -> MeshPool:
-    """The pool of the objects of a source with a stem: training for one half, tuning and reported for a quarter each."""
+    """The pool of a stem of a source: training for one half, tuning and reported for a quarter each."""
     part = hashlib.sha256(f"{source}/{stem}".encode()).digest()[0] % 4
     pools: tuple[MeshPool, ...] = ("training", "training", "tuning", "reported")
     return pools[part]
@@ -186,8 +186,9 @@ def open_objects(folder: str | Path, scale: float = 1.0, up: Literal["auto", "y"
     """Read and check all meshes of a folder.
 
     Lengths in the files are multiplied by `scale`. `up` is the axis that points up in the files; "auto" is y for glTF
-    files and z for others. Raises InputError if the folder has no meshes, or a mesh is unreadable, empty, or not of the
-    size of objects on a table. Whether surfaces are closed is checked when an object is used (`MeshObject.surface`).
+    files and z for others. Raises InputError if the folder has no meshes, or a mesh is unreadable, empty, or not of
+    the size of objects on a table. Whether surfaces are closed is checked when an object is used
+    (`MeshObject.surface`).
     """
     path = find_folder(str(folder))
     files = sorted(p for p in path.rglob("*") if p.suffix.lower() in (*_ENDINGS, ".npz", ".csv"))
@@ -351,7 +352,7 @@ def _read_mesh(path: Path) -> Triangles:
 
 
 def _looks(part: Any) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray | None]:
-    """Colours of the corners (F, 3, 3), image (h, w, 3), and corners in the image (F, 3, 2) of a part, where known."""
+    """Colours of corners (F, 3, 3), image (h, w, 3), and corners in the image (F, 3, 2) of a part, if known."""
     visual = part.visual
     if visual.kind == "face":
         return np.repeat(np.asarray(visual.face_colors, np.uint8)[:, None, :3], 3, axis=1), None, None

@@ -1,27 +1,28 @@
 """Models of depth sensors and of a colour camera.
 
-The default `DepthSensor` is a Kinect v1 or Xtion. It shifts pixels on depth edges sideways, in small patches. Disparity
-has Gaussian noise and is rounded to eighths of a Kinect pixel (f = 525 pixels, baseline 75 mm). Noise and rounding give
-depth a standard deviation of 1.85 mm (z / m)^2, as measured on real table tops. There is no reading in the shadow of the
-projector (to the left of objects), at some depth edges, on surfaces at a grazing angle, and out of range.
+The default `DepthSensor` is a Kinect v1 or Xtion. It shifts pixels on depth edges sideways, in small patches.
+Disparity has Gaussian noise and is rounded to eighths of a Kinect pixel (f = 525 pixels, baseline 75 mm). Noise and
+rounding give depth a standard deviation of 1.85 mm (z / m)^2, as measured on real table tops. There is no reading in
+the shadow of the projector (to the left of objects), at some depth edges, on surfaces at a grazing angle, and out of
+range.
 
 `SENSORS` has models of further cameras, as a `DepthSensor` with other fields. The disparity d = f b / z of a stereo
-camera has errors of a part of a pixel, so depth has a standard deviation of z^2 / (f b) times this part. A camera that
-measures time of flight has no baseline: errors grow with the distance and with the darkness of the surface, and pixels at
-depth edges read distances between both surfaces (flying pixels). Dark surfaces reflect too little light to be read, and
-surfaces like mirrors too much. Errors that depend on the whole scene, such as light that is reflected twice, are not
-modelled. Sources of the constants:
+camera has errors of a part of a pixel, so depth has a standard deviation of z^2 / (f b) times this part. A camera
+that measures time of flight has no baseline: errors grow with the distance and with the darkness of the surface, and
+pixels at depth edges read distances between both surfaces (flying pixels). Dark surfaces reflect too little light to
+be read, and surfaces like mirrors too much. Errors that depend on the whole scene, such as light that is reflected
+twice, are not modelled. Sources of the constants:
 
 - Xtion: 45 real frames; Khoshelham and Elberink, "Accuracy and resolution of Kinect depth data for indoor mapping
   applications", Sensors 12(2), 2012 (baseline, eighths of a pixel).
-- D415, D435: Intel RealSense D400 series datasheet (baselines 55 and 50 mm, horizontal fields of view 65 and 87 degrees
-  at 1280 and 848 pixels, nearest distances 0.45 and 0.28 m), and Grunnet-Jepsen, Sweetser and Woodfill, "Tuning depth
-  cameras for best performance" (a root mean square error of 0.08 pixels of disparity).
+- D415, D435: Intel RealSense D400 series datasheet (baselines 55 and 50 mm, horizontal fields of view 65 and 87
+  degrees at 1280 and 848 pixels, nearest distances 0.45 and 0.28 m), and Grunnet-Jepsen, Sweetser and Woodfill,
+  "Tuning depth cameras for best performance" (a root mean square error of 0.08 pixels of disparity).
 - Azure Kinect: hardware specification (narrow field of view 75 degrees, 0.5 to 3.86 m, standard deviation at most
   17 mm); Tölgyessy, Dekan, Chovanec and Hubinský, "Evaluation of the Azure Kinect and its comparison to Kinect v1 and
   Kinect v2", Sensors 21(2), 2021, confirms this bound and describes flying pixels and dark materials.
-- L515: Intel RealSense LiDAR camera L515 datasheet (field of view 70 degrees, 0.25 to 9 m, standard deviation 2.5 mm at
-  1 m on a surface that reflects 95 % of the light).
+- L515: Intel RealSense LiDAR camera L515 datasheet (field of view 70 degrees, 0.25 to 9 m, standard deviation 2.5 mm
+  at 1 m on a surface that reflects 95 % of the light).
 
 Shares of lost and flying pixels, the darkest surface and the standard deviation of the Azure Kinect at 1 m are
 assumptions, except for the Xtion. The correlation of stereo noise is that of a matching window of about 7 pixels.
@@ -79,7 +80,8 @@ class DepthSensor(Bounded):
     quantum, noise : float
         Step of the disparity, and standard deviation of the disparity before it is rounded, pixels.
     correlation : float
-        Standard deviation of the blur that makes the noise of neighbouring pixels alike, pixels. 0 is independent noise.
+        Standard deviation of the blur that makes the noise of neighbouring pixels alike, pixels. 0 is independent
+        noise.
     axial : float
         Of time of flight: standard deviation of the distance at 1 m on a white surface, metres. It grows with the
         distance and with the inverse root of the reflected share of light.
@@ -188,8 +190,8 @@ class DepthSensor(Bounded):
         return there > least + self.fill * w / 640.0
 
 
-#: Depth cameras by name. Disparities in pixels of the depth image (1280 pixels per row for the D415, 848 for the D435)
-#: are converted to pixels of images of 640 pixels with the focal length of the colour image.
+#: Depth cameras by name. Disparities in pixels of the depth image (1280 pixels per row for the D415, 848 for the
+#: D435) are converted to pixels of images of 640 pixels with the focal length of the colour image.
 SENSORS: dict[str, DepthSensor] = {
     "xtion": DepthSensor(),
     "d415": DepthSensor(

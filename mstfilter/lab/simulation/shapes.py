@@ -21,14 +21,14 @@ as a pack of cans.
 `label_voxels` returns the true volume: all voxels of each object, visible or not. A voxel belongs to an object if
 
 - its centre is inside the object, or
-- a wall thinner than a voxel passes through it: let f be the share of the voxel that is inside, and F the largest share
-  of a cube of the same size that contains the voxel's centre. The wall is thin if F < 0.7, and the voxel belongs to the
-  object if also f >= F / 2.
+- a wall thinner than a voxel passes through it: let f be the share of the voxel that is inside, and F the largest
+  share of a cube of the same size that contains the voxel's centre. The wall is thin if F < 0.7, and the voxel
+  belongs to the object if also f >= F / 2.
 
-Across a plane wall of any thickness, the second rule gives a layer of one voxel, so a thin wall has no holes, and solid
-objects keep their volume. The inside of a mesh is a matter of the parity of rays (`surfaces`). No wall of the objects
-that are made of pieces is thinner than 0.7 voxels of 1 cm, so for them the first rule decides, and the second is not
-evaluated. With larger voxels, the walls of bowls and mugs may have holes.
+Across a plane wall of any thickness, the second rule gives a layer of one voxel, so a thin wall has no holes, and
+solid objects keep their volume. The inside of a mesh is a matter of the parity of rays (`surfaces`). No wall of the
+objects that are made of pieces is thinner than 0.7 voxels of 1 cm, so for them the first rule decides, and the second
+is not evaluated. With larger voxels, the walls of bowls and mugs may have holes.
 
 >>> from mstfilter.scene import VoxelGrid
 >>> from mstfilter.lab.simulation.shapes import label_voxels
@@ -225,8 +225,8 @@ class Part:
 def label_voxels(shapes: Sequence[Shape], poses: np.ndarray, grid: VoxelGrid) -> np.ndarray:
     """Labels (X, Y, Z) uint16: k + 1 for the voxels of shape k (see the definition above), and 0 for other voxels.
 
-    `poses` (n, 4, 4) are T_world_object. Objects at rest overlap by less than a millimetre. A voxel of two objects gets
-    the label of the object that has its centre, and otherwise of the first object.
+    `poses` (n, 4, 4) are T_world_object. Objects at rest overlap by less than a millimetre. A voxel of two objects
+    gets the label of the object that has its centre, and otherwise of the first object.
     """
     labels = np.zeros(grid.shape, np.uint16)
     thin: list[tuple[tuple[slice, ...], np.ndarray, int]] = []
@@ -251,7 +251,7 @@ def label_voxels(shapes: Sequence[Shape], poses: np.ndarray, grid: VoxelGrid) ->
 def _centres_inside(
     shape: Shape, turn: np.ndarray, at: np.ndarray, grid: VoxelGrid, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
-    """Which voxels from index `low` (3,) to `high` (3,) have their centres in a shape at T_world_object (turn, at)."""
+    """Which voxels from index `low` (3,) to `high` (3,) have their centres in a shape with pose (turn, at)."""
     if shape.surface is not None:
         return _filled(shape, turn, at, grid.centre_of(low), grid.voxel_size, tuple(high - low)) >= 0.5
     index = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high, strict=True)), indexing="ij"), -1)

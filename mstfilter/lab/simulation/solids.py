@@ -89,7 +89,7 @@ class Piece:
 
 
 def placed(piece: Piece, rotation: np.ndarray, position: np.ndarray, scale: float = 1.0) -> Piece:
-    """The piece in a body whose frame is turned by `rotation` (3, 3) and shifted to `position` (3,) in a larger body."""
+    """The piece in a larger body, turned by `rotation` (3, 3) and shifted by `position` (3,)."""
     vertices = None if piece.vertices is None else piece.vertices * scale
     size, centre = tuple(scale * s for s in piece.size), rotation @ (scale * piece.centre) + position
     return Piece(piece.kind, size, centre, rotation @ piece.rotation, vertices, piece.plain)

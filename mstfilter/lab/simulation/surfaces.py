@@ -1,9 +1,9 @@
 """Objects with a triangle mesh as surface: volume by ray parity, colours and normals of surface points.
 
-A `Surface` is a mesh that is prepared for simulation. Rays hit the mesh itself, contacts use convex pieces of the mesh,
-and the true volume comes from parallel rays: along a line that crosses a closed surface, the parts between the first
-and second, third and fourth (...) crossing are inside. Lines along all three axes give the share of each small cell
-that is inside (`volume_fractions`).
+A `Surface` is a mesh that is prepared for simulation. Rays hit the mesh itself, contacts use convex pieces of the
+mesh, and the true volume comes from parallel rays: along a line that crosses a closed surface, the parts between the
+first and second, third and fourth (...) crossing are inside. Lines along all three axes give the share of each small
+cell that is inside (`volume_fractions`).
 
 Lines also show whether a mesh has an inside at all. If a line crosses the surface an odd number of times, a ray from
 a point to one end and the ray to the other end disagree whether the point is inside. `volume_fractions` returns the
@@ -17,9 +17,9 @@ mean share of rays that agree, 1 for a closed surface:
 >>> bool(abs(volume.share.sum() * 0.002**3 - 1e-3) < 1e-5), volume.agreement
 (True, 1.0)
 
-The convex pieces are made by the library CoACD (Wei, Liu, Ling and Su, "Approximate convex decomposition for 3D meshes
-with collision-aware concavity and tree search", ACM Transactions on Graphics 41(4), 2022), which takes seconds. So a
-prepared surface is stored in the user's cache folder, under a hash of the mesh (`prepared`).
+The convex pieces are made by the library CoACD (Wei, Liu, Ling and Su, "Approximate convex decomposition for 3D
+meshes with collision-aware concavity and tree search", ACM Transactions on Graphics 41(4), 2022), which takes
+seconds. So a prepared surface is stored in the user's cache folder, under a hash of the mesh (`prepared`).
 """
 
 from __future__ import annotations
@@ -376,8 +376,8 @@ def _convex_pieces(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
         max_ch_vertex=32,
         seed=0,
     )
-    # The clipping of pieces leaves some that are nearly flat, which a physics engine cannot use.
-    # Pieces may reach a few millimetres beyond the mesh; within its bounding box, the mesh stands on the table itself.
+    # The clipping of pieces leaves some that are nearly flat, which a physics engine cannot use. Pieces may reach a
+    # few millimetres beyond the mesh; within its bounding box, the mesh stands on the table itself.
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     pieces = [np.clip(np.asarray(corners), low, high) for corners, _ in parts]
     return tuple(corners for corners in pieces if _is_solid(corners)) or (vertices,)
@@ -413,7 +413,8 @@ def prepare(mesh: Triangles, agreement_at_least: float = 0.0) -> Surface:
 def prepared(mesh: Triangles, folder: Path, agreement_at_least: float = 0.0) -> Surface:
     """The prepared surface of a centred mesh, from the cache `folder` if it is there.
 
-    Several processes may prepare the same mesh at the same time. A file is written under a temporary name and renamed.
+    Several processes may prepare the same mesh at the same time. A file is written under a temporary name and
+    renamed.
     """
     try:
         coacd = version("coacd")

@@ -9,8 +9,9 @@
 True
 
 The time step is 2 ms, the integrator is implicit, and friction cones are elliptic. Objects are unions of convex
-pieces with torsional and rolling friction. Rays hit the mesh of an object that has one, and the pieces of others. The finger is a capsule on three slides with stiff position actuators. The
-arm above the finger is visible but has no contacts.
+pieces with torsional and rolling friction. Rays hit the mesh of an object that has one, and the pieces of others. The
+finger is a capsule on three slides with stiff position actuators. The arm above the finger is visible but has no
+contacts.
 
 An action is a `FingerPush`: the finger comes down, moves in a straight line, and goes up and away. `choose_push`
 simulates dozens of candidate pushes from one state, and takes the first push that moves enough objects and neither
@@ -47,8 +48,8 @@ _PARKED = np.array([0.0, -4.0, 1.0])  # the finger between actions: behind the c
 _FINGER_RADIUS = 0.011
 _FINGER_HALF = 0.10
 _CONTACT_GAP = 0.0005  # nearer pairs are contacts (without force): bodies at rest touch up to solver noise
-# conaffinity 4 matches no contype, so a visible geom touches nothing. MuJoCo's rays skip the bounding volumes of geoms
-# with contype = conaffinity = 0.
+# conaffinity 4 matches no contype, so a visible geom touches nothing. MuJoCo's rays skip the bounding volumes of
+# geoms with contype = conaffinity = 0.
 _VISIBLE = 'contype="0" conaffinity="4" mass="0"'
 _AWAY = 50.0  # where objects are before they are placed
 
