@@ -37,12 +37,15 @@ class SceneObjects:
     """Shapes and textures of the objects of a scene."""
 
     shapes: tuple[Shape, ...]
-    skins: tuple[Skin, ...]
-    twin_of: tuple[int, ...]  #: For each object, the index of the object that it copies, or -1
+    skins: tuple[Skin, ...] = ()
+    twin_of: tuple[int, ...] = ()  #: For each object, the index of the object that it copies, or -1; empty for none
     groups: tuple[Group, ...] = ()  #: objects that stand together; they come first
     n_dropped: int = 0  #: number of objects that fall onto others; they come last
     base: bool = False  #: whether the first object is a board or tray on which others stand
     wall: Wall | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "twin_of", self.twin_of or (-1,) * len(self.shapes))
 
 
 def draw_objects(

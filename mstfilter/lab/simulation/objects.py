@@ -126,7 +126,7 @@ class ObjectSet:
 
     folder: Path
     objects: tuple[MeshObject, ...]
-    indexed: bool = False  #: whether the folder has an index with sources: sources are drawn with equal probability
+    indexed: bool = False  #: whether the folder has archives: sources are balanced, and sizes vary
     key: str = field(init=False)  #: a hash of all objects
 
     def __post_init__(self) -> None:
@@ -159,8 +159,10 @@ class ObjectSet:
         objects = tuple(one for one in objects if one.name not in but) or objects
         if not self.indexed:
             return objects[int(rng.integers(len(objects)))].shape(1.0)
+        # A source with four times as many objects is drawn twice as often.
         sources = sorted({one.source for one in objects})
-        source = sources[int(rng.integers(len(sources)))]
+        counts = np.array([sum(one.source == source for one in objects) for source in sources])
+        source = sources[int(rng.choice(len(sources), p=np.sqrt(counts) / np.sqrt(counts).sum()))]
         these = [one for one in objects if one.source == source]
         chosen = these[int(rng.integers(len(these)))]
         longest = 2 * float(chosen.half.max())
