@@ -21,20 +21,20 @@ import numpy as np
 from mstfilter.base.errors import InputError
 from mstfilter.base.files import read_csv, write_csv
 from mstfilter.lab.simulation import SimulatedScene, scene_family
-from mstfilter.lab.simulation.world import advance_push, finish_push
+from mstfilter.lab.simulation.world import advance_push, draw_push, finish_push, is_clear
 
 MESHES = ("m1", "m2", "m3")
 GENERATED = ("s1", "s2", "row", "stack", "pack")
 
 
 def lowest(scene: SimulatedScene) -> float:
-    """Height of the lowest point of all objects, metres."""
-    poses = scene.world.poses()
-    return min(
+    """Height of the lowest point of all boxes and meshes, metres."""
+    heights = [
         float((shape.corners @ pose[2, :3]).min() + pose[2, 3])
-        for shape, pose in zip(scene.world.shapes, poses, strict=True)
+        for shape, pose in zip(scene.world.shapes, scene.world.poses(), strict=True)
         if shape.surface is not None or shape.family in ("carton", "brick", "book", "box", "board", "tray")
-    )
+    ]
+    return min(heights, default=0.0)
 
 
 def measure(family: str, seed: int, objects: str) -> dict[str, object]:
@@ -48,17 +48,18 @@ def measure(family: str, seed: int, objects: str) -> dict[str, object]:
     seconds, world = time.process_time() - began, scene.world
     row: dict[str, object] = {"family": family, "seed": seed, "error": "", "seconds": round(seconds, 2)}
     row |= {"objects": world.n_objects, "overlap_mm": round(1000 * world.deepest_overlap(), 3)}
-    row["lowest_mm"] = round(1000 * lowest(scene), 3) if np.isfinite(lowest(scene)) else 0.0
+    row["lowest_mm"] = round(1000 * lowest(scene), 3)
     before = world.positions()
     row["speed"] = round(float(np.abs(world.data.qvel[world._velocity_index]).max()), 4)
     world.step(500)
     row["shift_mm"] = round(1000 * float(np.linalg.norm(world.positions() - before, axis=1).max()), 3)
     world.forward()
-    try:
-        push = scene.choose_push(0)
-    except InputError:
+    rng, fastest = np.random.default_rng(seed), 0.0
+    push = next(
+        (p for p in (draw_push(rng, world, scene.family) for _ in range(100)) if is_clear(world, p.start)), None
+    )
+    if push is None:
         return row | {"fastest": "", "rests": ""}
-    fastest = 0.0
     for k in range(28):
         advance_push(world, push, k * push.seconds / 28, (k + 1) * push.seconds / 28)
         linear = world.data.qvel[world._velocity_index[:, :3]]

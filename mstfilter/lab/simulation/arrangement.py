@@ -19,7 +19,7 @@ from mstfilter.lab.simulation.objects import MeshPool
 from mstfilter.lab.simulation.shapes import Pool, Shape, board, draw_shape, tray
 from mstfilter.lab.simulation.surfaces import Surface
 from mstfilter.lab.simulation.textures import Skin, draw_skin
-from mstfilter.lab.simulation.world import OBJECT_GROUP, PhysicsWorld, Wall
+from mstfilter.lab.simulation.world import MESH_GROUP, OBJECT_GROUP, PhysicsWorld, Wall
 from mstfilter.scene import Camera
 
 _RestPose = Literal["any", "tall", "low"]  # which of its rest poses a shape takes
@@ -307,7 +307,9 @@ def _place_group(rng: np.random.Generator, world: PhysicsWorld, group: Group, fi
 def _visible_pixels(world: PhysicsWorld, camera: Camera) -> np.ndarray:
     """Number of visible pixels of each object (n,)."""
     turn = camera.pose.as_matrix()[:3, :3]
-    geom, _, _ = world.cast(np.array(camera.position), camera.rays().reshape(-1, 3) @ turn.T, (OBJECT_GROUP,))
+    geom, _, _ = world.cast(
+        np.array(camera.position), camera.rays().reshape(-1, 3) @ turn.T, (OBJECT_GROUP, MESH_GROUP)
+    )
     return np.bincount(world.geom_object[geom[geom >= 0]], minlength=world.n_objects + 1)[1 : world.n_objects + 1]
 
 

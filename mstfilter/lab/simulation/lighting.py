@@ -9,9 +9,18 @@ from numpy.typing import ArrayLike
 
 from mstfilter.lab.simulation.shapes import Shape
 from mstfilter.lab.simulation.textures import Atlas, Room, linear_light, texture_coordinates
-from mstfilter.lab.simulation.world import FINGER_GROUP, FINGER_ID, OBJECT_GROUP, PhysicsWorld
+from mstfilter.lab.simulation.world import (
+    FINGER_GROUP,
+    FINGER_ID,
+    MESH_GROUP,
+    OBJECT_GROUP,
+    PIECE_GROUP,
+    PhysicsWorld,
+)
 
-SHADOW_GROUPS = (OBJECT_GROUP, FINGER_GROUP)  #: Geoms that cast shadows
+SHADOW_GROUPS = (OBJECT_GROUP, FINGER_GROUP, MESH_GROUP)  #: Geoms that cast shadows on bodies
+_TABLE_SHADOW_GROUPS = (OBJECT_GROUP, FINGER_GROUP, PIECE_GROUP)  # on the table, the pieces of meshes do
+_SHARED, _NEAR = 3, 0.006  # points next to each other on a mesh that share shadow rays; metres between them at most
 
 _LIFT = 0.0012  # metres off the surface, against shadows of a surface on itself
 _MAP_LOW, _MAP_HIGH = np.array([-0.62, -0.55]), np.array([0.62, 0.66])
@@ -64,16 +73,35 @@ class Stage:
         self._mj.mj_kinematics(self.world.model, self._data)
 
     def cast(
-        self, origin: ArrayLike, directions: np.ndarray, groups: Sequence[int] = (0, 1, 2)
+        self, origin: ArrayLike, directions: np.ndarray, groups: Sequence[int] = (0, 1, 2, 4)
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Cast rays as in `PhysicsWorld.cast`, with bodies at the rendered poses."""
         return self.world.cast(origin, directions, groups, self._data)
 
 
-def _cosine_to_light(stage: Stage, light: np.ndarray, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Cosine (n,) float32 of the angle between normal and light direction at points (n, 3), 0 in shadow."""
+def _representatives(geom: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """For each point (n,), the first of up to three points in a row that are near and on the same geom."""
+    index = np.arange(len(geom))
+    first = index - index % _SHARED
+    apart = np.abs(points - points[first]).max(axis=1, initial=0.0) > _NEAR
+    return np.where((geom != geom[first]) | apart, index, first)
+
+
+def _cosine_to_light(
+    stage: Stage, light: np.ndarray, points: np.ndarray, normal: np.ndarray, representatives: np.ndarray | None = None
+) -> np.ndarray:
+    """Cosine (n,) float32 of the angle between normal and light direction at points (n, 3), 0 in shadow.
+
+    A point is in shadow if its representative (n,) is.
+    """
     ray = points - light
     cosine = -_dot(ray, normal) / np.sqrt(_dot(ray, ray))
+    if representatives is not None:
+        own = np.unique(representatives)
+        _, distance, _ = stage.cast(light, ray[own], SHADOW_GROUPS)
+        clear = np.zeros(len(points), bool)
+        clear[own] = (distance < 0) | (distance > 1.0 - 1e-6)
+        return np.where(clear[representatives], np.maximum(cosine, 0.0), 0.0).astype(np.float32)
     lit = np.flatnonzero(cosine > 0.0)
     _, distance, _ = stage.cast(light, ray[lit], SHADOW_GROUPS)
     visible = (distance < 0) | (distance > 1.0 - 1e-6)
@@ -102,7 +130,7 @@ class LightMap:
         """Compute the raster from shadow rays at the rendered poses."""
         self._values[:] = 0
         for light, rays, cosine in zip(self._lights, self._rays, self._cosine, strict=True):
-            _, distance, _ = stage.cast(light, rays, SHADOW_GROUPS)
+            _, distance, _ = stage.cast(light, rays, _TABLE_SHADOW_GROUPS)
             dark = (distance >= 0) & (distance <= 1.0 - 1e-6)
             self._values += np.where(dark, np.float32(0), cosine)
         self._values /= np.float32(len(self._lights))
@@ -145,7 +173,9 @@ class BodyColours:
         highlight = np.clip(_dot(_unit(middle), smooth), 0, 1).astype(np.float32) ** 40
         # Light reflected by the table reaches surfaces that face down or sideways, less near the table.
         bounce = ((0.5 - 0.5 * smooth[:, 2]) * np.clip(points[:, 2] / 0.05, 0.35, 1)).astype(np.float32)
-        lamp, sky = self._light(instance, (points + _LIFT * normal).astype(np.float32), smooth.astype(np.float32))
+        shared = _representatives(geom, points) if self._stage.world.has_meshes else None
+        off_surface = (points + _LIFT * normal).astype(np.float32)
+        lamp, sky = self._light(instance, off_surface, smooth.astype(np.float32), shared)
         reflected = bounce[:, None] * (np.float32(0.55 / 0.6) * room.rim)
         colour = albedo * (lamp + sky + room.ambient + reflected) + (gloss * highlight)[:, None] * lamp
         mirror = np.clip(_dot(_unit(self._eye - points), smooth), 0, 1).astype(np.float32) ** 40
@@ -187,17 +217,24 @@ class BodyColours:
             smooth[on] = _rotate(rounded, turn)
         return albedo, gloss, smooth
 
-    def _light(self, instance: np.ndarray, points: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _light(
+        self, instance: np.ndarray, points: np.ndarray, normal: np.ndarray, shared: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Light (n, 3) from the lamp, and light (n, 3) from the ceiling, at points (n, 3)."""
         room, finger = self._room, instance == FINGER_ID
+        among_others = None
+        if shared is not None:  # no point of the finger represents another body, and the reverse
+            among_others = (np.cumsum(~finger) - 1)[shared[~finger]]
         lamp, sky = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)
         for light in room.lamp:
-            lamp += _cosine_to_light(self._stage, light, points.astype(float), normal)
+            lamp += _cosine_to_light(self._stage, light, points.astype(float), normal, shared)
         for light in room.sky:
             cosine = np.empty(len(points), np.float32)
             # Finger and arm are dark: shadows of the ceiling's light on them would be invisible.
             cosine[finger] = np.maximum(_dot(_unit(light - points[finger]), normal[finger]), 0.0)
-            cosine[~finger] = _cosine_to_light(self._stage, light, points[~finger].astype(float), normal[~finger])
+            cosine[~finger] = _cosine_to_light(
+                self._stage, light, points[~finger].astype(float), normal[~finger], among_others
+            )
             sky += cosine
         lamp, sky = lamp / np.float32(len(room.lamp)), sky / np.float32(len(room.sky))
         return lamp[:, None] * room.lamp_colour, sky[:, None] * room.sky_colour

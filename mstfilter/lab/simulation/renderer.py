@@ -14,7 +14,7 @@ import numpy as np
 from mstfilter.lab.simulation.lighting import SHADOW_GROUPS, BodyColours, LightMap, Stage
 from mstfilter.lab.simulation.sensor import NEIGHBOURS
 from mstfilter.lab.simulation.textures import Atlas, Room, Skin
-from mstfilter.lab.simulation.world import FINGER_GROUP, OBJECT_GROUP, ROOM_GROUP, TABLE, PhysicsWorld
+from mstfilter.lab.simulation.world import FINGER_GROUP, MESH_GROUP, OBJECT_GROUP, ROOM_GROUP, TABLE, PhysicsWorld
 from mstfilter.scene import Camera
 
 _OFFSETS = ((-0.34, 0.14), (0.34, -0.14))  # of further rays within a pixel on an edge: rows, columns
@@ -151,7 +151,7 @@ class Renderer:
 
     def _colours(self, rays: np.ndarray) -> np.ndarray:
         """Colours (k, 3) of the surfaces that rays (k, 3) hit."""
-        geom, z, normal = self.stage.cast(self._eye, rays, (ROOM_GROUP, OBJECT_GROUP, FINGER_GROUP))
+        geom, z, normal = self.stage.cast(self._eye, rays, (ROOM_GROUP, OBJECT_GROUP, FINGER_GROUP, MESH_GROUP))
         points = self._eye + rays * z[:, None]
         result = np.empty((len(rays), 3), np.float32)
         body = (geom >= 0) & (self.stage.world.geom_object[geom] > 0)

@@ -253,7 +253,9 @@ def _centres_inside(
 ) -> np.ndarray:
     """Which voxels from index `low` (3,) to `high` (3,) have their centres in a shape with pose (turn, at)."""
     if shape.surface is not None:
-        return _filled(shape, turn, at, grid.centre_of(low), grid.voxel_size, tuple(high - low)) >= 0.5
+        first = turn.T @ (grid.centre_of(low) - at) / shape.scale
+        step = grid.voxel_size / shape.scale
+        return shape.surface.inside.resampled(first, turn.T, step, tuple(high - low)) >= 0.5
     index = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high, strict=True)), indexing="ij"), -1)
     return shape.inside((grid.centre_of(index) - at) @ turn)
 
@@ -264,7 +266,7 @@ def _filled(
     """How far a raster of points (size) from `origin` (3,) on, in world axes, is inside a shape: 0 .. 1, float32."""
     if shape.surface is not None:
         first = turn.T @ (origin - at) / shape.scale
-        return shape.surface.inside.resampled(first, turn.T, step / shape.scale, size)
+        return shape.surface.inside.resampled(first, turn.T, step / shape.scale, size, blur=True)
     filled = np.empty(size, np.float32)
     for i in range(size[0]):
         plane = np.stack(np.meshgrid([i], np.arange(size[1]), np.arange(size[2]), indexing="ij"), -1)

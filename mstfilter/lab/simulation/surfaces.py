@@ -92,15 +92,25 @@ class Volume:
     share: np.ndarray  #: (X, Y, Z) float32: share of each cell that is inside
     agreement: float  #: mean share of rays that agree whether a point is inside
 
-    def resampled(self, origin: np.ndarray, axes: np.ndarray, step: float, shape: tuple[int, ...]) -> np.ndarray:
+    @functools.cached_property
+    def _blurred(self) -> np.ndarray:
+        from scipy.ndimage import uniform_filter
+
+        return np.asarray(uniform_filter(self.share, 2, mode="constant", origin=-1))
+
+    def resampled(
+        self, origin: np.ndarray, axes: np.ndarray, step: float, shape: tuple[int, ...], blur: bool = False
+    ) -> np.ndarray:
         """Shares (shape) float32 interpolated at the points ``origin + step * (axes @ (i, j, k))`` of the raster.
 
-        `origin` (3,) in metres and the columns of `axes` (3, 3) are in the frame of the mesh.
+        `origin` (3,) in metres and the columns of `axes` (3, 3) are in the frame of the mesh. With `blur`, a share is
+        the mean of 2 x 2 x 2 cells, so that walls of a cell are not missed by points that are farther apart.
         """
         from scipy.ndimage import affine_transform
 
-        first = (origin - self.origin) / self.cell - 0.5
-        return np.asarray(affine_transform(self.share, axes * (step / self.cell), first, shape, order=1))
+        first = (origin - self.origin) / self.cell - (1.0 if blur else 0.5)
+        share = self._blurred if blur else self.share
+        return np.asarray(affine_transform(share, axes * (step / self.cell), first, shape, order=1))
 
 
 def _columns(flat: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:

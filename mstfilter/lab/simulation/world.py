@@ -40,7 +40,7 @@ TABLE = ((0.85, 0.66, 0.02), (0.0, 0.04, -0.02))  #: Half edges and centre of th
 FLOOR_HEIGHT = -0.72
 
 ROOM_GROUP, OBJECT_GROUP, FINGER_GROUP = 0, 1, 2  #: Groups of geoms that rays can be limited to
-_HIDDEN_GROUP = 3  # pieces of objects with a mesh: contacts only
+PIECE_GROUP, MESH_GROUP = 3, 4  #: Pieces of objects with a mesh (not visible, but cheap for rays), and meshes
 
 _TIME_STEP = 0.002
 _WALL_DISTANCE = 1.9
@@ -91,7 +91,7 @@ def _surface_xml(part: Part, name: str) -> tuple[str, str]:
     return (
         f'<mesh name="{name}" vertex="{_numbers(vertices)}" face="{faces}" inertia="shell"/>',
         f'<geom type="mesh" mesh="{name}" pos="{_numbers(part.position)}" quat="{_numbers(quaternion)}" {_VISIBLE} '
-        f'group="{OBJECT_GROUP}"/>',
+        f'group="{MESH_GROUP}"/>',
     )
 
 
@@ -100,7 +100,7 @@ def _model_xml(shapes: Sequence[Shape], arm: bool, wall: Wall | None) -> str:
     for i, shape in enumerate(shapes):
         geoms = []
         groups = [
-            OBJECT_GROUP if part.shape.surface is None else _HIDDEN_GROUP
+            OBJECT_GROUP if part.shape.surface is None else PIECE_GROUP
             for part in shape.surfaces
             for _ in part.shape.pieces
         ]
@@ -192,6 +192,7 @@ class PhysicsWorld:
         )
         self.geom_surface: np.ndarray = np.full(self.model.ngeom, -1)
         self._meshes = np.zeros(self.model.ngeom, bool)
+        self.has_meshes: bool = any(part.shape.surface is not None for _, part in self.surfaces)
         first = 0
         for shape, body in zip(shapes, bodies.tolist(), strict=True):
             count = len(shape.surfaces)
@@ -306,14 +307,15 @@ class PhysicsWorld:
         self.forward()
 
     def cast(
-        self, origin: ArrayLike, directions: np.ndarray, groups: Sequence[int] = (0, 1, 2), data: Any = None
+        self, origin: ArrayLike, directions: np.ndarray, groups: Sequence[int] = (0, 1, 2, 4), data: Any = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Cast rays from one point (3,), in metres, along directions (n, 3) of any length.
 
-        `groups` has the numbers of the geom groups that rays can hit: 0 for the room, 1 for objects, 2 for finger and
-        arm. `data` is another state of the same model. The default is the state of the world after `forward`. Returns
-        the first geom (n,) int32 that each ray hits (-1 for none), the distance (n,), and the normal (n, 3) of the
-        surface. The distance is in units of the length of the direction.
+        `groups` has the numbers of the geom groups that rays can hit: 0 for the room, 1 for objects without a mesh, 2
+        for finger and arm, 3 for the convex pieces of objects with a mesh, 4 for meshes. `data` is another state of
+        the same model. The default is the state of the world after `forward`. Returns the first geom (n,) int32 that
+        each ray hits (-1 for none), the distance (n,), and the normal (n, 3) of the surface. The distance is in units
+        of the length of the direction.
         """
         n = len(directions)
         geom, distance = np.full(n, -1, np.int32), np.full(n, -1.0)
@@ -325,7 +327,7 @@ class PhysicsWorld:
             rays = np.ascontiguousarray(directions, dtype=np.float64).reshape(-1)
             flat = normal.reshape(-1)
             self._mj.mj_multiRay(self.model, state, start, rays, visible, True, -1, geom, distance, flat, n, 1e6)
-            if self._meshes.any():  # the faces of a mesh may be turned inside out
+            if self.has_meshes:  # the faces of a mesh may be turned inside out
                 on = np.flatnonzero((geom >= 0) & self._meshes[geom])
                 turned = on[(directions[on] * normal[on]).sum(axis=1) > 0]
                 normal[turned] *= -1.0

@@ -49,7 +49,7 @@ def write_ply(path: Path, vertices, faces, colours=None):
     lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
     for k, v in enumerate(vertices):
         lines.append(
-            " ".join(map(repr, map(float, v))) + ("" if colours is None else " %d %d %d" % tuple(colours[k]))
+            " ".join(map(repr, map(float, v))) + ("" if colours is None else " " + " ".join(map(str, colours[k])))
         )
     lines += [f"3 {a} {b} {c}" for a, b, c in faces]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -68,6 +68,39 @@ def test_a_recording_of_five_own_objects(folder, tmp_path):
         assert (recording.path / name).read_bytes() == (again.path / name).read_bytes()
 
 
+def test_three_commands_make_a_recording_a_run_and_a_report(folder, tmp_path, monkeypatch):
+    from mstfilter.app.cli import main
+
+    monkeypatch.chdir(tmp_path)
+    small = [f"{name}={str(value).lower()}" for name, value in TINY.items()]
+    commands = (
+        ["simulate", "s1", "recordings/mine", "n_twins=0", *small, "--objects", str(folder)],
+        ["run", "recordings/mine", "--out", "runs/mine", "--no-report", "n=2"],
+        ["report", "runs/mine"],
+    )
+    for command in commands:
+        try:
+            main(command)
+        except SystemExit as end:
+            assert not end.code, command
+    assert "<html" in (tmp_path / "runs/mine/report.html").read_text(encoding="utf-8")
+
+
+def test_a_study_names_a_folder_of_objects(folder, tmp_path):
+    from mstfilter.runs.study import load_study, make_plan
+
+    study = tmp_path / "study.toml"
+    scenes = '[[scenes]]\nfamily = "s1"\nseeds = 0\nobjects = "mine"\n'
+    study.write_text(scenes + "[[arms]]\npreset = 'floor_components'\n", encoding="utf-8")
+    (tmp_path / "mine").symlink_to(folder)
+    (scene,) = make_plan(load_study(study)).scenes
+    assert scene.source["set"]["objects"] == str(folder)
+    assert scene.key == recipe_key(replace(scene_family("s1"), objects=str(folder)), 0)
+    study.write_text('[[scenes]]\nrecordings = "x"\nobjects = "mine"\n', encoding="utf-8")
+    with pytest.raises(InputError, match="neither seeds, set nor objects"):
+        load_study(study)
+
+
 def test_the_key_of_a_recording_depends_on_the_content_of_the_folder_and_not_on_its_place(folder, tmp_path):
     copies = [tmp_path / name / "mine" for name in ("a", "b")]
     for copy in copies:
