@@ -23,12 +23,12 @@ as a pack of cans.
 - its centre is inside the object, or
 - a wall thinner than a voxel passes through it: let f be the share of the voxel that is inside, and F the largest
   share of a cube of the same size that contains the voxel's centre. The wall is thin if F < 0.7, and the voxel
-  belongs to the object if also f >= F / 2.
+  belongs to the object if also f >= 0.48 F.
 
-Across a plane wall of any thickness, the second rule gives a layer of one voxel, so a thin wall has no holes, and
-solid objects keep their volume. The inside of a mesh is a matter of the parity of rays (`surfaces`). No wall of the
-objects that are made of pieces is thinner than 0.7 voxels of 1 cm, so for them the first rule decides, and the second
-is not evaluated. With larger voxels, the walls of bowls and mugs may have holes.
+Across a plane wall of any thickness, the second rule gives a layer of about one voxel (with 0.5, exactly one), so a
+thin wall has no holes, and solid objects keep their volume. The inside of a mesh is a matter of the parity of rays
+(`surfaces`). No wall of the objects that are made of pieces is thinner than 0.7 voxels of 1 cm, so for them the first
+rule decides, and the second is not evaluated. With larger voxels, the walls of bowls and mugs may have holes.
 
 >>> from mstfilter.scene import VoxelGrid
 >>> from mstfilter.lab.simulation.shapes import label_voxels
@@ -59,6 +59,7 @@ _N_HUES = 12
 _MARGIN = 0.04  # share of a band that is left free at either side
 
 _THIN = 0.7  # a wall is thin where no cube of the size of a voxel is filled to this share
+_HALF = 0.48  # share of the largest share; at a half, a plane wall is one voxel thick, and rounding makes holes
 _FINE = 4  # points a voxel and axis, for shares of volume
 _WALL = 0.010  # thickness of the walls of bowl and mug, metres
 
@@ -288,7 +289,7 @@ def _thin_walls(
     most = maximum_filter(share, _FINE + 1)
     voxels = tuple(slice(_FINE, -_FINE, _FINE) for _ in range(3))
     f, largest = share[voxels], most[voxels]
-    return (largest < _THIN) & (f >= largest / 2) & (f > 0.01)
+    return (largest < _THIN) & (f >= _HALF * largest) & (f > 0.01)
 
 
 def _choose(rng: np.random.Generator, table: Mapping[str, tuple[float, ...]]) -> tuple[str, tuple[float, ...]]:

@@ -110,7 +110,8 @@ class Volume:
 
         first = (origin - self.origin) / self.cell - (1.0 if blur else 0.5)
         share = self._blurred if blur else self.share
-        return np.asarray(affine_transform(share, axes * (step / self.cell), first, shape, order=1))
+        matrix = axes * (step / self.cell)
+        return np.asarray(affine_transform(share, matrix, first, shape, order=1, mode="grid-constant"))
 
 
 def _columns(flat: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:

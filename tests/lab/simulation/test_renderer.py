@@ -263,7 +263,7 @@ def test_the_renderer_reports_reflectance_and_shine():
     shape, camera = draw_shape(np.random.default_rng(0), "can"), kinect()
     view = rendered(shape, (0, 0, shape.half[2]), camera)
     on = view.instance == 1
-    assert 0 < view.reflectance[on].min() and view.reflectance[on].max() <= 1
+    assert view.reflectance[on].min() > 0 and view.reflectance[on].max() <= 1
     assert (view.shine[~on] == 0).all() and view.shine[on].max() <= 1
 
 
