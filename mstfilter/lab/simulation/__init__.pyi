@@ -16,7 +16,6 @@ from mstfilter.lab.simulation.push_loop import LoopState as LoopState, PushLoop 
 from mstfilter.lab.simulation.recorder import (
     POSE_TOLERANCE as POSE_TOLERANCE,
     SimulatedScene as SimulatedScene,
-    cache_folder as cache_folder,
     cached_path as cached_path,
     cached_recording as cached_recording,
     recipe_key as recipe_key,
@@ -28,6 +27,7 @@ from mstfilter.lab.simulation.sensor import (
     DepthSensor as DepthSensor,
     colour_reading as colour_reading,
 )
+from mstfilter.lab.simulation.surfaces import cache_folder as cache_folder
 from mstfilter.lab.simulation.world import (
     FingerPush as FingerPush,
     PushEffect as PushEffect,

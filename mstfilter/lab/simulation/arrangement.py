@@ -17,7 +17,7 @@ from mstfilter.lab.simulation.families import SceneFamily
 from mstfilter.lab.simulation.groups import Group, about_z, draw_group
 from mstfilter.lab.simulation.objects import MeshPool
 from mstfilter.lab.simulation.shapes import Pool, Shape, board, draw_shape, tray
-from mstfilter.lab.simulation.surfaces import Surface
+from mstfilter.lab.simulation.surfaces import MeshSurface
 from mstfilter.lab.simulation.textures import Skin, draw_skin
 from mstfilter.lab.simulation.world import MESH_GROUP, OBJECT_GROUP, PhysicsWorld, Wall
 from mstfilter.scene import Camera
@@ -130,7 +130,7 @@ def _draw_rest_pose(rng: np.random.Generator, shape: Shape, pose: _RestPose = "a
     return (yaw * lay).as_matrix(), float(shape.half[axis])
 
 
-def _mesh_pose(rng: np.random.Generator, surface: Surface, pose: _RestPose) -> np.ndarray:
+def _mesh_pose(rng: np.random.Generator, surface: MeshSurface, pose: _RestPose) -> np.ndarray:
     """An orientation (3, 3) of a mesh: most often upright or on a side, seldom in a pose in which it cannot rest."""
     from scipy.spatial.transform import Rotation
 

@@ -33,7 +33,7 @@ import numpy as np
 from mstfilter.base.errors import InputError, missing_library
 from mstfilter.base.files import reading
 from mstfilter.lab.simulation.shapes import Shape
-from mstfilter.lab.simulation.surfaces import Surface, Triangles, centred, prepared
+from mstfilter.lab.simulation.surfaces import MeshSurface, Triangles, cache_folder, centred, prepared_mesh
 
 MeshPool = Literal["training", "tuning", "reported", "all"]
 
@@ -89,7 +89,7 @@ class MeshObject:
         """Half edges (3,) of the bounding box, metres."""
         return np.abs(self.triangles.vertices).max(axis=0)
 
-    def surface(self) -> Surface:
+    def surface(self) -> MeshSurface:
         """The prepared mesh. Raises InputError if the surface is open."""
         try:
             return _prepared(self.triangles)
@@ -107,10 +107,8 @@ class MeshObject:
 
 
 @functools.lru_cache(maxsize=512)
-def _prepared(triangles: Triangles) -> Surface:
-    from mstfilter.lab.simulation.recorder import cache_folder
-
-    return prepared(triangles, cache_folder() / "objects", AGREEMENT)
+def _prepared(triangles: Triangles) -> MeshSurface:
+    return prepared_mesh(triangles, cache_folder() / "objects", AGREEMENT)
 
 
 def _finish(kind: str, half: np.ndarray) -> tuple[str, ...]:

@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 import warnings
 from collections.abc import Callable
@@ -45,6 +44,7 @@ from mstfilter.lab.simulation.lighting import Stage
 from mstfilter.lab.simulation.renderer import Renderer, View, visible_texel
 from mstfilter.lab.simulation.sensor import colour_reading
 from mstfilter.lab.simulation.shapes import label_voxels
+from mstfilter.lab.simulation.surfaces import cache_folder
 from mstfilter.lab.simulation.textures import Room, draw_room
 from mstfilter.lab.simulation.world import (
     FINGER_ID,
@@ -222,13 +222,6 @@ def _describe_push(push: FingerPush, result: PushEffect) -> dict[str, Any]:
         "settled": result.settled,
         "all_kept": result.kept,
     }
-
-
-def cache_folder() -> Path:
-    """Folder of cached files: the variable MSTFILTER_CACHE, or else `mstfilter` in the user's cache folder."""
-    if folder := os.environ.get("MSTFILTER_CACHE"):
-        return Path(folder)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mstfilter"
 
 
 def recipe_key(family: SceneFamily, seed: int) -> str:

@@ -49,7 +49,7 @@ import numpy as np
 
 from mstfilter.base.errors import InputError
 from mstfilter.lab.simulation.solids import Piece, box, capsule, cylinder, ellipsoid, frustum, hull, placed, ring
-from mstfilter.lab.simulation.surfaces import Surface
+from mstfilter.lab.simulation.surfaces import MeshSurface
 from mstfilter.scene import VoxelGrid
 
 _SMALLEST, _BAND = 0.90, 0.025
@@ -123,7 +123,7 @@ class Shape:
     finish: tuple[str, ...]  #: styles of texture that suit the object
     rolling: float = 0.0005  #: rolling friction, metres
 
-    surface: Surface | None = None  #: the mesh of an object that is not just its pieces
+    surface: MeshSurface | None = None  #: the mesh of an object that is not just its pieces
     scale: float = 1.0  #: size of the object divided by the size of the mesh
     parts: tuple[Part, ...] = ()  #: shapes that are one body
 
@@ -146,7 +146,7 @@ class Shape:
 
     @classmethod
     def of_surface(
-        cls, surface: Surface, scale: float, family: str, name: str, mass: float, finish: tuple[str, ...]
+        cls, surface: MeshSurface, scale: float, family: str, name: str, mass: float, finish: tuple[str, ...]
     ) -> Shape:
         """The shape of a mesh, `scale` times as large as the mesh."""
         pieces = tuple(placed(piece, np.eye(3), np.zeros(3), scale) for piece in surface.pieces)

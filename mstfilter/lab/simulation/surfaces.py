@@ -1,6 +1,6 @@
 """Objects with a triangle mesh as surface: volume by ray parity, colours and normals of surface points.
 
-A `Surface` is a mesh that is prepared for simulation. Rays hit the mesh itself, contacts use convex pieces of the
+A `MeshSurface` is a mesh that is prepared for simulation. Rays hit the mesh itself, contacts use convex pieces of the
 mesh, and the true volume comes from parallel rays: along a line that crosses a closed surface, the parts between the
 first and second, third and fourth (...) crossing are inside. Lines along all three axes give the share of each small
 cell that is inside (`volume_fractions`).
@@ -19,13 +19,14 @@ mean share of rays that agree, 1 for a closed surface:
 
 The convex pieces are made by the library CoACD (Wei, Liu, Ling and Su, "Approximate convex decomposition for 3D
 meshes with collision-aware concavity and tree search", ACM Transactions on Graphics 41(4), 2022), which takes
-seconds. So a prepared surface is stored in the user's cache folder, under a hash of the mesh (`prepared`).
+seconds. So a prepared surface is stored in the user's cache folder, under a hash of the mesh (`prepared_mesh`).
 """
 
 from __future__ import annotations
 
 import functools
 import hashlib
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -199,7 +200,7 @@ def _directions(normal: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class MeshSurface:
     """A mesh that is prepared for simulation. The origin is the middle of the bounding box."""
 
     vertices: np.ndarray  #: (V, 3) float64, metres
@@ -313,7 +314,7 @@ def _corner_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _surface_cells(mesh: Triangles, half: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """The fields `cells`, `normals` and `colours` of a `Surface`."""
+    """The fields `cells`, `normals` and `colours` of a `MeshSurface`."""
     vertices, faces = mesh.vertices, mesh.faces
     corner = _corner_normals(vertices, faces)
     a, b, c = (vertices[faces[:, k]] for k in range(3))
@@ -401,7 +402,7 @@ def _is_solid(corners: np.ndarray) -> bool:
     return bool(spread[2] / np.sqrt(len(corners)) > 2e-4)
 
 
-def prepare(mesh: Triangles, agreement_at_least: float = 0.0) -> Surface:
+def prepare_mesh(mesh: Triangles, agreement_at_least: float = 0.0) -> MeshSurface:
     """Prepare a centred mesh: volume, convex pieces, colours and normals.
 
     Raises InputError if fewer rays than `agreement_at_least` agree whether points are inside.
@@ -418,10 +419,17 @@ def prepare(mesh: Triangles, agreement_at_least: float = 0.0) -> Surface:
         )
     cells, normals, colours = _surface_cells(mesh, half)
     hulls = _convex_pieces(mesh.vertices, mesh.faces)
-    return Surface(mesh.vertices, mesh.faces.astype(np.int32), half, hulls, inside, cells, normals, colours)
+    return MeshSurface(mesh.vertices, mesh.faces.astype(np.int32), half, hulls, inside, cells, normals, colours)
 
 
-def prepared(mesh: Triangles, folder: Path, agreement_at_least: float = 0.0) -> Surface:
+def cache_folder() -> Path:
+    """Folder of cached files: the variable MSTFILTER_CACHE, or else `mstfilter` in the user's cache folder."""
+    if folder := os.environ.get("MSTFILTER_CACHE"):
+        return Path(folder)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mstfilter"
+
+
+def prepared_mesh(mesh: Triangles, folder: Path, agreement_at_least: float = 0.0) -> MeshSurface:
     """The prepared surface of a centred mesh, from the cache `folder` if it is there.
 
     Several processes may prepare the same mesh at the same time. A file is written under a temporary name and
@@ -433,7 +441,7 @@ def prepared(mesh: Triangles, folder: Path, agreement_at_least: float = 0.0) -> 
         raise missing_library(error, "a mesh as a rigid body") from error
     path = folder / f"{mesh.key}-{_FORMAT}-{coacd}.npz"
     if (found := _load(path)) is None:
-        found = prepare(mesh, agreement_at_least)
+        found = prepare_mesh(mesh, agreement_at_least)
         try:
             make_folders(folder, 0o700)
             _store(found, path)
@@ -446,7 +454,7 @@ def prepared(mesh: Triangles, folder: Path, agreement_at_least: float = 0.0) -> 
     return found
 
 
-def _store(surface: Surface, path: Path) -> None:
+def _store(surface: MeshSurface, path: Path) -> None:
     arrays = {
         "vertices": surface.vertices,
         "faces": surface.faces,
@@ -465,7 +473,7 @@ def _store(surface: Surface, path: Path) -> None:
         np.savez_compressed(file, **arrays)
 
 
-def _load(path: Path) -> Surface | None:
+def _load(path: Path) -> MeshSurface | None:
     """The stored surface; None if there is none, or its file is damaged."""
     if not path.is_file():
         return None
@@ -476,7 +484,7 @@ def _load(path: Path) -> Surface | None:
         cell, agreement = z["cell"].tolist()
         inside = Volume(z["origin"], cell, z["share"].astype(np.float32) / 255, agreement)
         surface = z["vertices"], z["faces"], z["half"], tuple(hulls), inside
-        return Surface(*surface, z["cells"], z["normals"], z.get("colours"))
+        return MeshSurface(*surface, z["cells"], z["normals"], z.get("colours"))
     except (OSError, ValueError, KeyError, EOFError):
         return None
     except Exception as error:

@@ -10,6 +10,7 @@ from mstfilter.base.errors import InputError
 from mstfilter.lab.simulation import SimulatedScene, open_objects, scene_family, simulate_recording
 from mstfilter.lab.simulation.objects import pool_of
 from mstfilter.lab.simulation.recorder import recipe_key
+from mstfilter.lab.simulation.world import play_push
 from tests.lab.simulation.meshes import box_mesh, cup_mesh, five_objects, write_obj, write_ply
 
 for _name in ("coacd", "trimesh"):
@@ -192,6 +193,14 @@ def test_pools_split_stems_by_halves_and_quarters():
     assert replace(family, mesh_pool="training").object_pool(1000) == "training"
 
 
+def test_a_pool_without_objects(folder):
+    names = {pool_of("", name) for name in ("block", "can", "carton", "cup", "tin")}
+    for pool in {"training", "tuning", "reported"} - names:
+        with pytest.raises(InputError, match="none of 5 objects is in the pool"):
+            open_objects(folder).of_pool(pool)
+    assert len(open_objects(folder).of_pool("all")) == 5
+
+
 def test_an_index_with_archives(tmp_path):
     boxes = [box_mesh((0.03, 0.04, 0.05)), box_mesh((0.02, 0.02, 0.06))]
     v, f = ([b[k] for b in boxes] for k in (0, 1))
@@ -220,3 +229,35 @@ def test_pools_of_the_household_meshes(shared_data):
     for one in objects:
         assert pools.setdefault((one.source, one.stem), one.pool) == one.pool
     assert {one.pool for one in objects if one.source == "urdf_models"} == {"training", "tuning", "reported"}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_own_objects_rest_and_neither_sink_nor_fly(folder, seed):
+    family = replace(scene_family("s1"), objects=str(folder), n_twins=0, n_dropped=1, furniture=1.0, **TINY)
+    scene = SimulatedScene(family, seed)
+    _at_rest(scene)
+    push = scene.choose_push(0)
+    before = scene.world.positions()
+    effect = play_push(scene.world, push, family)
+    assert effect.settled and effect.kept
+    assert np.linalg.norm(scene.world.positions() - before, axis=1).max() < 0.5
+
+
+@pytest.mark.slow
+def test_a_scene_of_household_meshes_rests(shared_data, monkeypatch):
+    monkeypatch.setenv("MSTFILTER_OBJECTS", str(shared_data("meshes")))
+    scene = SimulatedScene(replace(scene_family("m1"), **TINY), 0)
+    _at_rest(scene)
+    assert len(np.unique(scene.truth())) == scene.world.n_objects + 1
+
+
+def _at_rest(scene):
+    world = scene.world
+    assert world.deepest_overlap() < 0.0015
+    for shape, pose in zip(world.shapes, world.poses(), strict=True):
+        lowest = (shape.corners @ pose[2, :3]).min() + pose[2, 3]
+        assert lowest > -0.002
+    before = world.positions()
+    world.step(250)
+    assert np.linalg.norm(world.positions() - before, axis=1).max() < 0.003
+    world.forward()

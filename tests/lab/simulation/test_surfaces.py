@@ -10,18 +10,18 @@ from scipy.spatial.transform import Rotation
 from mstfilter.base.errors import InputError
 from mstfilter.lab.simulation import surfaces
 from mstfilter.lab.simulation.shapes import SHAPE_FAMILIES, Part, Shape, _thin_walls, draw_shape, label_voxels
-from mstfilter.lab.simulation.surfaces import Surface, prepare, prepared, volume_fractions
+from mstfilter.lab.simulation.surfaces import MeshSurface, prepare_mesh, prepared_mesh, volume_fractions
 from mstfilter.scene import VoxelGrid
 from tests.lab.simulation.meshes import box_mesh, cup_mesh, lathe_mesh, triangles
 
 GRID = VoxelGrid((-0.15, -0.15, -0.15), 0.01, (30, 30, 30))
 
 
-def surface_without_pieces(mesh, monkeypatch=None) -> Surface:
+def surface_without_pieces(mesh, monkeypatch=None) -> MeshSurface:
     """A prepared mesh whose only piece is its hull, as labels and colours need no pieces."""
     kept, surfaces._convex_pieces = surfaces._convex_pieces, lambda vertices, faces: (vertices,)
     try:
-        return prepare(surfaces.centred(mesh))
+        return prepare_mesh(surfaces.centred(mesh))
     finally:
         surfaces._convex_pieces = kept
 
@@ -56,7 +56,7 @@ def test_rays_disagree_about_the_inside_of_an_open_surface():
     vertices, faces = box_mesh((0.03, 0.04, 0.05))
     assert volume_fractions(vertices, faces[:-2], 0.002).agreement < 0.9  # without its lid
     with pytest.raises(InputError, match="the surface is open"):
-        prepare(triangles(vertices, faces[:-2]), 0.9)
+        prepare_mesh(triangles(vertices, faces[:-2]), 0.9)
 
 
 def test_faces_given_twice_or_inside_out_do_not_change_the_volume():
@@ -163,15 +163,15 @@ def test_rest_poses_of_a_mesh():
 def test_prepared_meshes_are_stored_and_damaged_files_are_made_again(tmp_path):
     pytest.importorskip("coacd", reason="the library coacd is not installed (the extra `objects`)")
     mesh = surfaces.centred(triangles(*cup_mesh()))
-    first = prepared(mesh, tmp_path)
+    first = prepared_mesh(mesh, tmp_path)
     (file,) = tmp_path.iterdir()
-    again = prepared(mesh, tmp_path)
+    again = prepared_mesh(mesh, tmp_path)
     assert 6 <= len(first.hulls) <= 24
     for a, b in zip(first.hulls, again.hulls, strict=True):
         np.testing.assert_array_equal(a, b)
     np.testing.assert_array_equal(first.inside.share, again.inside.share)
     Path(file).write_bytes(b"PK damaged")
-    np.testing.assert_array_equal(prepared(mesh, tmp_path).cells, first.cells)
+    np.testing.assert_array_equal(prepared_mesh(mesh, tmp_path).cells, first.cells)
     assert surfaces._load(file) is not None
     # The hollow stays open: contacts of things in the cup are with its floor.
     pieces = Shape.of_surface(first, 1.0, "cup", "cup", 0.2, ("plain",)).pieces
