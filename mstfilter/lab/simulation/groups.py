@@ -308,6 +308,8 @@ def part_image(recording: Recording, frame: int) -> np.ndarray:
     filter, whether they are or not.
     """
     instance, image = recording.instance(frame), recording.frames[frame]
+    if recording.path is None or instance is None:
+        raise InputError(f"recording {recording.name} has no folder with poses and instances", "simulate it")
     poses = json.loads((Path(recording.path) / "poses.json").read_text(encoding="utf-8"))[frame]["T_world_object"]
     points = image.camera.unproject(image.depth)
     found = np.zeros(instance.shape, np.uint16)

@@ -223,7 +223,7 @@ def _read_index(path: Path) -> dict[str, dict[str, str]]:
         return {row["id"]: row for row in csv.DictReader(file) if row.get("id")}
 
 
-def _described(one: MeshObject, row: Mapping[str, str]) -> dict[str, str]:
+def _described(one: MeshObject, row: Mapping[str, str]) -> dict[str, Any]:
     kind = row.get("class") or "other"
     return {"source": row.get("source") or "", "stem": row.get("stem") or one.name, "kind": kind}
 
@@ -363,7 +363,9 @@ def _looks(part: Any) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray 
     material = visual.material
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     if image is not None and visual.uv is not None and len(visual.uv) == len(part.vertices):
-        place = np.asarray(visual.uv, np.float32)[part.faces] * np.float32([1, -1]) + np.float32([0, 1])
+        place = np.asarray(visual.uv, np.float32)[part.faces] * np.array([1, -1], np.float32) + np.array(
+            [0, 1], np.float32
+        )
         return None, np.asarray(image.convert("RGB"), np.uint8), place
     plain = np.asarray(material.main_color, np.uint8)[:3]
     return np.broadcast_to(plain, (len(part.faces), 3, 3)).copy(), None, None

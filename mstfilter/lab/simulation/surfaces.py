@@ -39,8 +39,9 @@ from mstfilter.base.errors import InputError, missing_library
 from mstfilter.base.files import atomic_path, make_folders
 from mstfilter.lab.simulation.solids import Piece, hull
 
-_FORMAT = 1  # raised whenever the content of prepared surfaces changes
+_FORMAT = 2  # raised whenever the content of prepared surfaces changes
 _CELL, _MOST_CELLS = 0.0015, 256  # edge of the cells of the volume, metres; most of them along an axis
+_UNCOVERED = 0.0007  # distance of a vertex from all convex pieces that is accepted, metres
 _TEXEL = 0.00125  # edge of the cells that hold colours and normals, metres
 _CREASE = np.cos(np.deg2rad(40.0))  # faces at a sharper edge are not shaded smoothly
 _IRRATIONAL = np.array([0.5 + 0.0414, 0.5 - 0.0732])  # lines off the middle of a cell seldom meet an edge of the mesh
@@ -392,7 +393,31 @@ def _convex_pieces(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
     # few millimetres beyond the mesh; within its bounding box, the mesh stands on the table itself.
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     pieces = [np.clip(np.asarray(corners), low, high) for corners, _ in parts]
-    return tuple(corners for corners in pieces if _is_solid(corners)) or (vertices,)
+    return _covering([corners for corners in pieces if _is_solid(corners)] or [vertices], vertices)
+
+
+def _covering(pieces: list[np.ndarray], vertices: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The pieces, each extended by the vertices of the mesh that no piece contains and that it is nearest to.
+
+    Without this, thin ends of long objects would sink into the table, because no piece reaches them.
+    """
+    from scipy.spatial import ConvexHull
+
+    nearest, piece_of = np.full(len(vertices), np.inf), np.zeros(len(vertices), int)
+    for k, corners in enumerate(pieces):
+        outside = np.full(len(vertices), -np.inf)  # distance to the farthest plane that has the vertex outside
+        for plane in ConvexHull(corners).equations:
+            np.maximum(outside, vertices @ plane[:3] + plane[3], out=outside)
+        closer = outside < nearest
+        nearest[closer], piece_of[closer] = outside[closer], k
+    extended = []
+    for k, corners in enumerate(pieces):
+        missing = vertices[(piece_of == k) & (nearest > _UNCOVERED)]
+        if len(missing):
+            both = np.concatenate([corners, missing])
+            corners = both[ConvexHull(both).vertices]
+        extended.append(corners)
+    return tuple(extended)
 
 
 def _is_solid(corners: np.ndarray) -> bool:

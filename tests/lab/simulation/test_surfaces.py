@@ -178,6 +178,17 @@ def test_prepared_meshes_are_stored_and_damaged_files_are_made_again(tmp_path):
     assert not any(piece.inside(np.array([0.0, 0.0, 0.02])) for piece in pieces)
 
 
+def test_pieces_reach_all_vertices_of_the_mesh():
+    vertices, _ = box_mesh((0.03, 0.04, 0.05))
+    tip = np.concatenate([vertices, [(0.0, 0.0, 0.09)]])
+    lower, upper = (np.array([v for v in vertices if sign * v[2] > 0]) for sign in (-1, 1))
+    halves = [np.concatenate([part, part * (1, 1, 0)]) for part in (lower, upper)]
+    extended = surfaces._covering(halves, tip)
+    inside = np.any([surfaces.hull(piece).inside(tip * (1 - 1e-9)) for piece in extended], axis=0)
+    assert inside.all()
+    np.testing.assert_array_equal(extended[0], halves[0])  # the tip belongs to the upper half
+
+
 def test_key_depends_on_vertices_faces_and_colours():
     mesh = triangles(*box_mesh((0.03, 0.04, 0.05)))
     grey = np.full((12, 3, 3), 100, np.uint8)
