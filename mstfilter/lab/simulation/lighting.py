@@ -20,7 +20,7 @@ from mstfilter.lab.simulation.world import (
 
 SHADOW_GROUPS = (OBJECT_GROUP, FINGER_GROUP, MESH_GROUP)  #: Geoms that cast shadows on bodies
 _TABLE_SHADOW_GROUPS = (OBJECT_GROUP, FINGER_GROUP, PIECE_GROUP)  # on the table, the pieces of meshes do
-_SHARED, _NEAR = 3, 0.006  # points next to each other on a mesh that share shadow rays; metres between them at most
+_NEAR = 0.008  # points of a block of pixels that share shadow rays: metres between them at most
 
 _LIFT = 0.0012  # metres off the surface, against shadows of a surface on itself
 _MAP_LOW, _MAP_HIGH = np.array([-0.62, -0.55]), np.array([0.62, 0.66])
@@ -79,12 +79,13 @@ class Stage:
         return self.world.cast(origin, directions, groups, self._data)
 
 
-def _representatives(geom: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """For each point (n,), the first of up to three points in a row that are near and on the same geom."""
-    index = np.arange(len(geom))
-    first = index - index % _SHARED
-    apart = np.abs(points - points[first]).max(axis=1, initial=0.0) > _NEAR
-    return np.where((geom != geom[first]) | apart, index, first)
+def _representatives(block: np.ndarray, geom: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """For each point (n,), the first point of its `block` (n,) and geom, or itself if that one is not near."""
+    key = block * (int(geom.max(initial=0)) + 1) + geom
+    _, first, same = np.unique(key, return_index=True, return_inverse=True)
+    found = first[same.reshape(-1)]
+    apart = np.abs(points - points[found]).max(axis=1, initial=0.0) > _NEAR
+    return np.where(apart, np.arange(len(geom)), found)
 
 
 def _cosine_to_light(
@@ -159,12 +160,13 @@ class BodyColours:
             self._first_piece += np.cumsum([0, *counts[:-1]]).tolist()
 
     def at(
-        self, geom: np.ndarray, points: np.ndarray, normal: np.ndarray
+        self, geom: np.ndarray, points: np.ndarray, normal: np.ndarray, block: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Linear colours (n, 3) float32 of points (n, 3) with normals (n, 3) on MuJoCo geoms (n,).
 
-        Also returns the share of light that the points reflect (n,), and the strength of the highlight (n,) of a lamp
-        at the camera, 0 .. 1.
+        `block` (n,) is the number of the block of pixels of each point; near points of a block share shadow rays in
+        worlds with meshes, for which rays take longer. Also returns the share of light that the points reflect (n,),
+        and the strength of the highlight (n,) of a lamp at the camera, 0 .. 1.
         """
         room, instance = self._room, self._stage.world.geom_object[geom]
         albedo, gloss, smooth = self._materials(instance, geom, points, normal)
@@ -173,7 +175,7 @@ class BodyColours:
         highlight = np.clip(_dot(_unit(middle), smooth), 0, 1).astype(np.float32) ** 40
         # Light reflected by the table reaches surfaces that face down or sideways, less near the table.
         bounce = ((0.5 - 0.5 * smooth[:, 2]) * np.clip(points[:, 2] / 0.05, 0.35, 1)).astype(np.float32)
-        shared = _representatives(geom, points) if self._stage.world.has_meshes else None
+        shared = _representatives(block, geom, points) if self._stage.world.has_meshes else None
         off_surface = (points + _LIFT * normal).astype(np.float32)
         lamp, sky = self._light(instance, off_surface, smooth.astype(np.float32), shared)
         reflected = bounce[:, None] * (np.float32(0.55 / 0.6) * room.rim)

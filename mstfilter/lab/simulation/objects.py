@@ -363,9 +363,8 @@ def _looks(part: Any) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray 
     material = visual.material
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     if image is not None and visual.uv is not None and len(visual.uv) == len(part.vertices):
-        place = np.asarray(visual.uv, np.float32)[part.faces] * np.array([1, -1], np.float32) + np.array(
-            [0, 1], np.float32
-        )
+        place = np.asarray(visual.uv, np.float32)[part.faces]
+        place[..., 1] = 1 - place[..., 1]
         return None, np.asarray(image.convert("RGB"), np.uint8), place
     plain = np.asarray(material.main_color, np.uint8)[:3]
     return np.broadcast_to(plain, (len(part.faces), 3, 3)).copy(), None, None

@@ -17,6 +17,7 @@ from mstfilter.lab.simulation.textures import Atlas, Room, Skin
 from mstfilter.lab.simulation.world import FINGER_GROUP, MESH_GROUP, OBJECT_GROUP, ROOM_GROUP, TABLE, PhysicsWorld
 from mstfilter.scene import Camera
 
+_BLOCK = 3  # side of the blocks of pixels that share shadow rays in worlds with meshes
 _OFFSETS = ((-0.34, 0.14), (0.34, -0.14))  # of further rays within a pixel on an edge: rows, columns
 
 
@@ -62,6 +63,8 @@ class Renderer:
         self._unit = (self._rays / np.linalg.norm(self._rays, axis=1)[:, None]).astype(np.float32)
         K = camera.K
         shifts = [np.array([du / K[0, 0], dv / K[1, 1], 0.0]) @ turn.T for dv, du in _OFFSETS]
+        rows, columns = np.indices((camera.height, camera.width)) // _BLOCK
+        self._block = (rows * camera.width + columns).ravel()
         self._further = [self._rays + shift for shift in shifts] if supersample else []
         self._bodies = BodyColours(self.stage, atlas, room, self._eye)
         self._render_background()
@@ -139,23 +142,23 @@ class Renderer:
         slant[hit] = self._slant(hit, facing[hit])
         points = self._eye + self._rays[hit] * z[hit, None]
         reflectance, shine = self._room_reflectance.copy(), np.zeros(h * w, np.float32)
-        colour[hit], reflectance[hit], shine[hit] = self._bodies.at(geom[hit], points, facing[hit])
+        colour[hit], reflectance[hit], shine[hit] = self._bodies.at(geom[hit], points, facing[hit], self._block[hit])
         if self._further:
             edge = _edge_pixels(instance.reshape(h, w), normal.reshape(h, w, 3))
             total = np.zeros((len(edge), 3), np.float32)
             for rays in self._further:
-                total += self._colours(rays[edge])
+                total += self._colours(rays[edge], self._block[edge])
             colour[edge] = (colour[edge] + total) / np.float32(1 + len(self._further))
         images = (image.reshape(h, w) for image in (depth, instance, slant, reflectance, shine))
         return View(colour.reshape(h, w, 3), *images)
 
-    def _colours(self, rays: np.ndarray) -> np.ndarray:
-        """Colours (k, 3) of the surfaces that rays (k, 3) hit."""
+    def _colours(self, rays: np.ndarray, block: np.ndarray) -> np.ndarray:
+        """Colours (k, 3) of the surfaces that rays (k, 3) of pixels in blocks (k,) hit."""
         geom, z, normal = self.stage.cast(self._eye, rays, (ROOM_GROUP, OBJECT_GROUP, FINGER_GROUP, MESH_GROUP))
         points = self._eye + rays * z[:, None]
         result = np.empty((len(rays), 3), np.float32)
         body = (geom >= 0) & (self.stage.world.geom_object[geom] > 0)
-        result[body] = self._bodies.at(geom[body], points[body], normal[body])[0]
+        result[body] = self._bodies.at(geom[body], points[body], normal[body], block[body])[0]
         geom, points, normal = geom[~body], points[~body], normal[~body]
         albedo, light = self._room_colours(geom, points, normal), self._unshadowed_light(points, normal)
         table = (geom == 0) & (normal[:, 2] > 0.5)
