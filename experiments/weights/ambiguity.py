@@ -23,11 +23,12 @@ from reliability import cells_of, recorded
 import mstfilter
 from mstfilter.base.files import read_csv, write_csv
 from mstfilter.lab.simulation.families import scene_family
+from mstfilter.lab.simulation.groups import about_z
 from mstfilter.lab.simulation.renderer import Renderer, visible_texel
 from mstfilter.lab.simulation.sensor import DepthSensor, colour_reading
 from mstfilter.lab.simulation.shapes import TUNING, Shape
 from mstfilter.lab.simulation.solids import box
-from mstfilter.lab.simulation.textures import Skin, draw_room, draw_skin
+from mstfilter.lab.simulation.textures import Skin, draw_room, draw_skin, sliced
 from mstfilter.lab.simulation.world import PhysicsWorld
 from mstfilter.scene import Clip, Frame
 from mstfilter.scoring.forecasts import ForecastTable
@@ -55,21 +56,6 @@ def joined(left: Skin, right: Skin) -> Skin:
     return Skin((*charts, left.charts[-1]), left.gloss)
 
 
-def halves(skin: Skin) -> tuple[Skin, Skin]:
-    """The print of one box, cut into the prints of its two halves along y. The opposite of `joined`."""
-    left, right = list(skin.charts), list(skin.charts)
-    for k, face in enumerate(FACES):
-        if face[1] != "y":
-            first, second = np.array_split(skin.charts[k], 2, axis=1 if face[1] == "x" else 0)
-            left[k], right[k] = (first, second) if face == "+x" else (second, first)
-    return Skin(tuple(left), skin.gloss), Skin(tuple(right), skin.gloss)
-
-
-def about_z(angle: float) -> np.ndarray:
-    """Rotation (3, 3) about the z axis, radians."""
-    return np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-
-
 def scene(seed: int) -> tuple[list[Clip], np.ndarray, dict[str, int]]:
     """Two images of a scene, the half (H, W) of each pixel (1 or 2, 0 is none), and what is true."""
     rng = np.random.default_rng([seed, 31])
@@ -77,11 +63,11 @@ def scene(seed: int) -> tuple[list[Clip], np.ndarray, dict[str, int]]:
     half = np.array([rng.uniform(0.02, 0.05), rng.uniform(0.025, 0.05), rng.uniform(0.03, 0.09)])
     whole, part = carton(half * (1, 2, 1)), carton(half)
     if prints == 2:
-        parts = (draw_skin(rng, part, TUNING), draw_skin(rng, part, TUNING))
+        parts = [draw_skin(rng, part, TUNING), draw_skin(rng, part, TUNING)]
         skin = joined(*parts)
     else:
         skin = draw_skin(rng, whole, TUNING)
-        parts = halves(skin)
+        parts = sliced(skin, 1, 2)
     offset, turned, yaw = OFFSET * rng.standard_normal(), TURN * rng.standard_normal(), rng.uniform(-np.pi, np.pi)
     turn, up = about_z(yaw), half[2]
     world = PhysicsWorld((part, part) if two else (whole,), arm=False)

@@ -23,7 +23,7 @@ from mstfilter.base.errors import InputError
 from mstfilter.base.files import atomic_path
 from mstfilter.base.processes import environment
 from mstfilter.base.reading import MAX_WEIGHTS, read_arrays
-from mstfilter.lab.simulation.arrangement import arrange_objects
+from mstfilter.lab.simulation.arrangement import SceneObjects, arrange_objects
 from mstfilter.lab.simulation.families import SceneFamily
 from mstfilter.lab.simulation.world import PhysicsWorld
 from mstfilter.scene import Camera, look_at, scene_cache
@@ -53,7 +53,7 @@ def draw_scene(rng: np.random.Generator, kinds: tuple[str, ...], largest: float 
     try:
         # Dropped objects start far away; the others are arranged first.
         first = PhysicsWorld([shapes[k] for k in order[n_dropped:]], arm=False)
-        arrange_objects(rng, first, replace(family, n_objects_min=n - n_dropped), (-1,) * (n - n_dropped))
+        arrange_objects(rng, first, replace(family, n_objects_min=n - n_dropped), SceneObjects(first.shapes))
     except InputError:
         return None
     for k, position, rotation in zip(order[n_dropped:].tolist(), first.positions(), first.rotations(), strict=True):

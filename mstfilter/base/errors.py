@@ -212,6 +212,8 @@ _PACKAGES = {
     "onnxruntime": "'mstfilter[onnx]'",
     "xarray": "'mstfilter[xarray]'",
     "distributed": "'mstfilter[cluster]'",
+    "coacd": "'mstfilter[objects]'",
+    "trimesh": "'mstfilter[objects]'",
 }
 
 

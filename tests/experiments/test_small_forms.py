@@ -172,3 +172,19 @@ def test_newcomer(tmp_path):
     rows = read_csv(tmp_path / "hour.csv")
     assert {row["part"] for row in rows} >= {"demo", "own arrays", "own component", "study", "viewer"}
     assert [row["step"] for row in rows if row["fault"]] == []
+
+
+def test_planted_faults(tmp_path):
+    """Some faults of the lists are named, and some right components are not rejected."""
+    faults = ["SortedNoise", "Coin", "EachTwice", "LogOfNegative", "Cosine", "Flat"]
+    right = ["Drift", "LoopUpdate", "Blob", "UniformDensity", "Same"]
+    names = [*faults, *right]
+    out = run_script("planted/run.py", "--only", *names, "--out", tmp_path)
+    assert "named 6 of 6 faults, rejected 0 of 5 right ones" in out
+
+
+def test_physics_of_simulated_scenes(tmp_path):
+    run_script("worlds/run.py", "--smoke", "--out", tmp_path)
+    rows = read_csv(tmp_path / "summary.csv")
+    assert [row["family"] for row in rows] == ["row", "stack"]
+    assert all(row[name] == "0" for row in rows for name in ("not_arranged", "sinks", "moves_at_rest", "explodes"))

@@ -61,7 +61,7 @@ def test_print_of_two_boxes_on_one():
     rng = np.random.default_rng(1)
     whole = ambiguity.carton(np.array([0.03, 0.08, 0.05]))
     skin = ambiguity.draw_skin(rng, whole, ambiguity.TUNING)
-    again = ambiguity.joined(*ambiguity.halves(skin))
+    again = ambiguity.joined(*ambiguity.sliced(skin, 1, 2))
     for one, other in zip(again.charts, skin.charts, strict=True):
         np.testing.assert_array_equal(one, other)
 

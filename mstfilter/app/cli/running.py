@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -147,9 +148,13 @@ def simulate_(
         typer.Argument(metavar="[FIELD=VALUE]...", help="Changes to the family: n_objects_max=8 n_actions=2"),
     ] = None,
     seed: Seed = 0,
+    objects: Annotated[
+        Path | None, typer.Option(help="Folder of meshes (.obj, .glb, .stl, .ply) of which the objects are drawn.")
+    ] = None,
 ) -> None:
     """Simulate a recording with ground truth."""
-    _simulate(family, out, seed, overrides or ())
+    named = [] if objects is None else [f"objects={json.dumps(str(objects))}"]
+    _simulate(family, out, seed, [*(overrides or ()), *named])
     print(f"recording   {out}")
 
 

@@ -14,13 +14,19 @@ filter:
 >>> images, labels = scene.frame_images(0), scene.truth()  # doctest: +SKIP
 >>> effect = play_push(scene.world, scene.choose_push(0), scene.family)  # doctest: +SKIP
 
-From bottom to top, the modules are `solids` and `shapes` (objects), `families` (parameters of scenes), `world`
-(MuJoCo physics, pushes), `printing` and `textures` (appearance), `arrangement` (placement), `lighting` and `renderer`
-(ray casting), `sensor` (noise), `recorder` (recordings and their cache) and `push_loop`.
+Objects are generated, or they are meshes of your own:
 
-Depth noise, the shadow of the projector and missing readings at edges are calibrated to real frames. What real scenes
-have and these do not: a moving camera, glossy or transparent surfaces, light reflected between objects, articulated
-or soft objects, a hand, and depth noise that is correlated within a surface.
+>>> simulate_recording(replace(scene_family("s1"), objects="my_objects"), 7, "recordings/mine-7")  # doctest: +SKIP
+
+From bottom to top, the modules are `solids`, `surfaces` and `shapes` (objects), `objects` (folders of meshes), `sensor`
+(noise), `families` (parameters of scenes), `world` (MuJoCo physics, pushes), `printing` and `textures` (appearance),
+`groups` (objects that stand together), `arrangement` (placement), `lighting` and `renderer` (ray casting), `recorder`
+(recordings and their cache) and `push_loop`.
+
+Depth noise, the shadow of the projector and missing readings at edges of the default sensor are calibrated to real
+frames; the other sensors follow published figures. What real scenes have and these do not: a moving camera,
+transparent surfaces and mirror images, light reflected between objects, articulated or soft objects, a hand, and depth
+noise that is correlated within a surface.
 """
 
 from mstfilter.base.lazy import attach

@@ -8,17 +8,27 @@ A family is a frozen `SceneFamily`. `dataclasses.replace` makes variants for `si
 and the studies use the names in `SCENE_FAMILIES`. New kinds of objects are added to `_MAKERS` in `shapes`. The
 studies use `s1`, `s2` and `s3` with 5, 9 and 15 to 20 objects and the same camera, sensor and textures. The field
 `catalogue` separates scenes for tuning from scenes for reporting. In `s1` to `s3`, the seed determines the catalogue.
+
+`m1`, `m2` and `m3` are like `s1` to `s3` with meshes of real objects (`objects`). The seed also determines the pool
+of meshes: below 1000 tuning, from 1000 on reported. Networks are trained on scenes with ``mesh_pool="training"``.
+
+In `row`, `stack` and `pack`, some things are several objects that touch, and some are one object that looks like
+several: a box with two prints, a pack of cans, a body of two parts. `one_share` is the share of the latter, and
+`push_aims` says whether a push moves one object of a group, moves the group as one body, or leaves all groups alone.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from mstfilter.base.errors import InputError, check_integer, suggestion
-from mstfilter.base.fields import Bounded, Bounds, NonNegativeInt, PositiveInt, Share
+from mstfilter.base.fields import Bounded, Bounds, NonNegativeInt, PositiveFloat, PositiveInt, Share
+from mstfilter.lab.simulation.objects import MeshPool, ObjectSet, open_objects
+from mstfilter.lab.simulation.sensor import SENSORS, DepthSensor
 from mstfilter.lab.simulation.shapes import ANY, REPORTED, SHAPE_FAMILIES, TUNING, Pool
 from mstfilter.scene import Camera, VoxelGrid, look_at
 
@@ -33,6 +43,10 @@ _POOLS = {"tuning": TUNING, "reported": REPORTED, "any": ANY}
 
 _ImageSize = Annotated[int, Bounds(at_least=16, at_most=4096)]
 _Edge = Annotated[float, Bounds(at_least=0.1, at_most=2.0)]
+_Degrees = Annotated[float, Bounds(at_least=-25.0, at_most=50.0, unit="number of degrees")]
+
+PUSH_AIMS = ("apart", "together", "nothing")  #: What a push does to groups of objects
+_FIRST_ADDED = "sensor"  # fields from this one on are described only if they differ from the default
 
 
 @dataclass(frozen=True)
@@ -75,12 +89,38 @@ class SceneFamily(Bounded):
     workspace_y: _Edge = 1.0
     workspace_z: _Edge = 0.5
     voxel_size: Annotated[float, Bounds(at_least=0.001, at_most=0.1)] = 0.01  #: edge of a voxel, metres
+    #: Depth camera: errors, missing readings and focal length; see `SENSORS`.
+    sensor: Literal["xtion", "d415", "d435", "azure", "l515"] = "xtion"
+    camera_higher: _Degrees = 0.0  #: degrees by which the camera looks down more steeply than by 35 degrees
+    #: Folder of meshes, of which the objects are drawn; see `mstfilter.lab.simulation.objects`. Variables of the
+    #: environment are replaced. Empty for generated objects.
+    objects: str = ""
+    mesh_share: Share = 1.0  #: probability that an object is a mesh, if `objects` names a folder
+    #: Pool of meshes. "by seed": the tuning pool for seeds below 1000, the reported pool from 1000 on.
+    mesh_pool: Literal["training", "tuning", "reported", "all", "by seed"] = "all"
+    object_scale: PositiveFloat = 1.0  #: factor of the lengths in the files of meshes, 0.001 for millimetres
+    object_up: Literal["auto", "y", "z"] = "auto"  #: axis that points up in the files; "auto": y for glTF, else z
+    n_dropped: NonNegativeInt = 0  #: objects that fall into, onto or against another object
+    furniture: Share = 0.0  #: probability that a wall, a board or a tray is in view
+    groups: Literal["", "row", "stack", "pack"] = ""  #: how the objects of a group stand
+    n_groups: NonNegativeInt = 0  #: groups of objects; the other objects are alone
+    one_share: Share = 0.5  #: probability that a group is one object that looks like several
+    #: What pushes do to groups, separated by commas: `apart`, `together`, `nothing`. Each push draws one. Empty:
+    #: pushes do not heed groups.
+    push_aims: str = ""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_integer("n_objects_max", self.n_objects_max, at_least=self.n_objects_min, at_most=40)
         for field in ("n_twins", "n_stacked", "n_hidden"):
             check_integer(field, getattr(self, field), at_least=0, at_most=self.n_objects_min - 1)
+        check_integer("n_groups", self.n_groups, at_least=0, at_most=self.n_objects_min)
+        check_integer("n_dropped", self.n_dropped, at_least=0, at_most=self.n_objects_min - 1)
+        if self.n_groups and not self.groups:
+            raise InputError(
+                f"scene family {self.name!r}: {self.n_groups} groups of no kind", "groups=row, stack or pack"
+            )
+        self.aims()
         self.shape_families()
         if self.n_actions and self.action_seconds < 1.0:
             raise InputError(
@@ -116,10 +156,48 @@ class SceneFamily(Bounded):
             )
         return names
 
+    def aims(self) -> tuple[str, ...]:
+        """The parts of `push_aims`."""
+        names = tuple(name.strip() for name in self.push_aims.split(",") if name.strip())
+        for name in names:
+            if name not in PUSH_AIMS:
+                raise InputError(f"scene family {self.name!r}: unknown aim of pushes {name!r}", *PUSH_AIMS)
+        return names
+
+    def depth_sensor(self) -> DepthSensor:
+        """The model of the depth camera."""
+        return SENSORS[self.sensor]
+
+    def object_set(self) -> ObjectSet | None:
+        """The objects with meshes; None if all objects are generated. Raises InputError if a mesh is not usable."""
+        return open_objects(self.objects, self.object_scale, self.object_up) if self.objects else None
+
+    def object_pool(self, seed: int) -> MeshPool:
+        """The pool of meshes from which the scene of a seed is drawn."""
+        if self.mesh_pool == "by seed":
+            return "tuning" if seed < FIRST_REPORTED_SEED else "reported"
+        return self.mesh_pool
+
+    def described(self) -> dict[str, Any]:
+        """The fields, without later additions at their defaults. A folder of objects is its name and content."""
+        names = [f.name for f in fields(self)]
+        added = names[names.index(_FIRST_ADDED) :]
+        default = {f.name: f.default for f in fields(self)}
+        found = {k: v for k, v in asdict(self).items() if k not in added or v != default[k]}
+        if (objects := self.object_set()) is not None:
+            found |= {"objects": Path(objects.folder).name, "objects_key": objects.key}
+        return found
+
     def camera(self) -> Camera:
-        """Camera of a Kinect that looks down at the middle of the table, scaled to the images of the family."""
-        eye = _LOOKS_AT + self.camera_distance * _TOWARDS_CAMERA
-        kinect = Camera.from_intrinsics(525.0, 525.0, 319.5, 239.5, 640, 480, look_at(eye, _LOOKS_AT))
+        """The camera, which looks down at the middle of the table, scaled to the images of the family."""
+        towards = _TOWARDS_CAMERA
+        if self.camera_higher:
+            across = float(np.hypot(*towards[:2]))
+            angle = np.arctan2(towards[2], across) + np.deg2rad(self.camera_higher)
+            towards = np.array([*(towards[:2] / across * np.cos(angle)), np.sin(angle)])
+        eye = _LOOKS_AT + self.camera_distance * towards
+        focal = self.depth_sensor().focal
+        kinect = Camera.from_intrinsics(focal, focal, 319.5, 239.5, 640, 480, look_at(eye, _LOOKS_AT))
         scaled = kinect.scaled(self.width / 640.0)
         # Images that are not 4 : 3 are cut or extended above and below, with the same middle.
         K = scaled.K.copy()
@@ -178,6 +256,17 @@ SCENE_FAMILIES: dict[str, SceneFamily] = {
     ),
     # Every push topples or turns an object, which shows sides that were hidden.
     "topple": replace(_S2, name="topple", min_moved=1, min_toppled=1),
+}
+
+_MESHES: dict[str, Any] = {"objects": "$MSTFILTER_OBJECTS", "mesh_pool": "by seed", "furniture": 0.2}
+_GROUPED = replace(_STUDIED, n_twins=0, n_stacked=0, min_moved=1, push_aims="apart, together, nothing")
+SCENE_FAMILIES |= {
+    "m1": replace(SCENE_FAMILIES["s1"], name="m1", n_twins=0, n_dropped=1, **_MESHES),
+    "m2": replace(_S2, name="m2", n_twins=1, n_dropped=2, **_MESHES),
+    "m3": replace(SCENE_FAMILIES["s3"], name="m3", n_twins=2, n_stacked=3, n_dropped=3, **_MESHES),
+    "row": replace(_GROUPED, name="row", n_objects_min=3, n_objects_max=5, groups="row", n_groups=2),
+    "stack": replace(_GROUPED, name="stack", n_objects_min=3, n_objects_max=5, groups="stack", n_groups=2),
+    "pack": replace(_GROUPED, name="pack", n_objects_min=2, n_objects_max=4, groups="pack", n_groups=1),
 }
 
 

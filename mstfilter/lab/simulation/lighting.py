@@ -8,10 +8,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mstfilter.lab.simulation.shapes import Shape
-from mstfilter.lab.simulation.textures import Atlas, Room, texture_coordinates
-from mstfilter.lab.simulation.world import FINGER_GROUP, FINGER_ID, OBJECT_GROUP, PhysicsWorld
+from mstfilter.lab.simulation.textures import Atlas, Room, linear_light, texture_coordinates
+from mstfilter.lab.simulation.world import (
+    FINGER_GROUP,
+    FINGER_ID,
+    MESH_GROUP,
+    OBJECT_GROUP,
+    PIECE_GROUP,
+    PhysicsWorld,
+)
 
-SHADOW_GROUPS = (OBJECT_GROUP, FINGER_GROUP)  #: Geoms that cast shadows
+SHADOW_GROUPS = (OBJECT_GROUP, FINGER_GROUP, MESH_GROUP)  #: Geoms that cast shadows on bodies
+_TABLE_SHADOW_GROUPS = (OBJECT_GROUP, FINGER_GROUP, PIECE_GROUP)  # on the table, the pieces of meshes do
+_NEAR = 0.008  # points of a block of pixels that share shadow rays: metres between them at most
 
 _LIFT = 0.0012  # metres off the surface, against shadows of a surface on itself
 _MAP_LOW, _MAP_HIGH = np.array([-0.62, -0.55]), np.array([0.62, 0.66])
@@ -64,16 +73,36 @@ class Stage:
         self._mj.mj_kinematics(self.world.model, self._data)
 
     def cast(
-        self, origin: ArrayLike, directions: np.ndarray, groups: Sequence[int] = (0, 1, 2)
+        self, origin: ArrayLike, directions: np.ndarray, groups: Sequence[int] = (0, 1, 2, 4)
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Cast rays as in `PhysicsWorld.cast`, with bodies at the rendered poses."""
         return self.world.cast(origin, directions, groups, self._data)
 
 
-def _cosine_to_light(stage: Stage, light: np.ndarray, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Cosine (n,) float32 of the angle between normal and light direction at points (n, 3), 0 in shadow."""
+def _representatives(block: np.ndarray, geom: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """For each point (n,), the first point of its `block` (n,) and geom, or itself if that one is not near."""
+    key = block * (int(geom.max(initial=0)) + 1) + geom
+    _, first, same = np.unique(key, return_index=True, return_inverse=True)
+    found = first[same.reshape(-1)]
+    apart = np.abs(points - points[found]).max(axis=1, initial=0.0) > _NEAR
+    return np.where(apart, np.arange(len(geom)), found)
+
+
+def _cosine_to_light(
+    stage: Stage, light: np.ndarray, points: np.ndarray, normal: np.ndarray, representatives: np.ndarray | None = None
+) -> np.ndarray:
+    """Cosine (n,) float32 of the angle between normal and light direction at points (n, 3), 0 in shadow.
+
+    A point is in shadow if its representative (n,) is.
+    """
     ray = points - light
     cosine = -_dot(ray, normal) / np.sqrt(_dot(ray, ray))
+    if representatives is not None:
+        own = np.unique(representatives)
+        _, distance, _ = stage.cast(light, ray[own], SHADOW_GROUPS)
+        clear = np.zeros(len(points), bool)
+        clear[own] = (distance < 0) | (distance > 1.0 - 1e-6)
+        return np.where(clear[representatives], np.maximum(cosine, 0.0), 0.0).astype(np.float32)
     lit = np.flatnonzero(cosine > 0.0)
     _, distance, _ = stage.cast(light, ray[lit], SHADOW_GROUPS)
     visible = (distance < 0) | (distance > 1.0 - 1e-6)
@@ -102,7 +131,7 @@ class LightMap:
         """Compute the raster from shadow rays at the rendered poses."""
         self._values[:] = 0
         for light, rays, cosine in zip(self._lights, self._rays, self._cosine, strict=True):
-            _, distance, _ = stage.cast(light, rays, SHADOW_GROUPS)
+            _, distance, _ = stage.cast(light, rays, _TABLE_SHADOW_GROUPS)
             dark = (distance >= 0) & (distance <= 1.0 - 1e-6)
             self._values += np.where(dark, np.float32(0), cosine)
         self._values /= np.float32(len(self._lights))
@@ -124,9 +153,21 @@ class BodyColours:
 
     def __init__(self, stage: Stage, atlas: Atlas, room: Room, eye: np.ndarray) -> None:
         self._stage, self._atlas, self._room, self._eye = stage, atlas, room, eye
+        #: Of each surface of the world, the index of its first piece among the pieces of its body.
+        self._first_piece: list[int] = []
+        for shape in stage.world.shapes:
+            counts = [len(part.shape.pieces) for part in shape.surfaces]
+            self._first_piece += np.cumsum([0, *counts[:-1]]).tolist()
 
-    def at(self, geom: np.ndarray, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """Linear colours (n, 3) float32 of points (n, 3) with normals (n, 3) on MuJoCo geoms (n,)."""
+    def at(
+        self, geom: np.ndarray, points: np.ndarray, normal: np.ndarray, block: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Linear colours (n, 3) float32 of points (n, 3) with normals (n, 3) on MuJoCo geoms (n,).
+
+        `block` (n,) is the number of the block of pixels of each point; near points of a block share shadow rays in
+        worlds with meshes, for which rays take longer. Also returns the share of light that the points reflect (n,),
+        and the strength of the highlight (n,) of a lamp at the camera, 0 .. 1.
+        """
         room, instance = self._room, self._stage.world.geom_object[geom]
         albedo, gloss, smooth = self._materials(instance, geom, points, normal)
         # Highlight by Blinn and Phong: the normal against the half vector between eye and lamp.
@@ -134,9 +175,13 @@ class BodyColours:
         highlight = np.clip(_dot(_unit(middle), smooth), 0, 1).astype(np.float32) ** 40
         # Light reflected by the table reaches surfaces that face down or sideways, less near the table.
         bounce = ((0.5 - 0.5 * smooth[:, 2]) * np.clip(points[:, 2] / 0.05, 0.35, 1)).astype(np.float32)
-        lamp, sky = self._light(instance, (points + _LIFT * normal).astype(np.float32), smooth.astype(np.float32))
+        shared = _representatives(block, geom, points) if self._stage.world.has_meshes else None
+        off_surface = (points + _LIFT * normal).astype(np.float32)
+        lamp, sky = self._light(instance, off_surface, smooth.astype(np.float32), shared)
         reflected = bounce[:, None] * (np.float32(0.55 / 0.6) * room.rim)
-        return albedo * (lamp + sky + room.ambient + reflected) + (gloss * highlight)[:, None] * lamp
+        colour = albedo * (lamp + sky + room.ambient + reflected) + (gloss * highlight)[:, None] * lamp
+        mirror = np.clip(_dot(_unit(self._eye - points), smooth), 0, 1).astype(np.float32) ** 40
+        return colour, albedo.mean(axis=1), np.minimum(2.5 * gloss, 1.0) * mirror
 
     def _materials(
         self, instance: np.ndarray, geom: np.ndarray, points: np.ndarray, normal: np.ndarray
@@ -147,30 +192,51 @@ class BodyColours:
         albedo[instance == FINGER_ID] = _FINGER_COLOUR
         gloss = np.full(len(points), 0.25, np.float32)
         smooth = normal.copy()
-        for k in np.unique(instance[instance != FINGER_ID]) - 1:
-            shape: Shape = world.shapes[k]
-            on = np.flatnonzero(instance == k + 1)
-            turn = poses[k, :3, :3]
-            local = _rotate(points[on] - poses[k, :3, 3], turn.T)
+        surface_of = world.geom_surface[geom]
+        for s in np.unique(surface_of[surface_of >= 0]):
+            k, part = world.surfaces[s]
+            shape: Shape = part.shape
+            on = np.flatnonzero(surface_of == s)
+            turn, at = poses[k, :3, :3], poses[k, :3, 3]
+            if world.shapes[k].parts:
+                turn, at = turn @ part.rotation, at + turn @ part.position
+            local = _rotate(points[on] - at, turn.T)
             facing = _rotate(normal[on], turn.T)
-            plain = np.array([piece.plain for piece in shape.pieces])[world.geom_piece[geom[on]]]
-            chart, place = texture_coordinates(shape, local, facing, plain)
-            albedo[on] = self._atlas.colour(int(k), chart, place)
-            gloss[on] = self._atlas.gloss[k]
-            smooth[on] = _rotate(_round_off(shape, local, facing, plain), turn)
+            gloss[on] = self._atlas.gloss[s]
+            if shape.surface is not None:
+                cell = shape.surface.look_up(local / shape.scale, facing)
+                rounded = shape.surface.smooth(cell, facing)
+                if shape.surface.colours is not None:
+                    albedo[on] = linear_light(shape.surface.colours[cell])
+                else:
+                    chart, place = texture_coordinates(shape, local, facing, np.zeros(len(on), bool))
+                    albedo[on] = self._atlas.colour(int(s), chart, place)
+            else:
+                plain = np.array([p.plain for p in shape.pieces])[world.geom_piece[geom[on]] - self._first_piece[s]]
+                chart, place = texture_coordinates(shape, local, facing, plain)
+                albedo[on] = self._atlas.colour(int(s), chart, place)
+                rounded = _round_off(shape, local, facing, plain)
+            smooth[on] = _rotate(rounded, turn)
         return albedo, gloss, smooth
 
-    def _light(self, instance: np.ndarray, points: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _light(
+        self, instance: np.ndarray, points: np.ndarray, normal: np.ndarray, shared: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Light (n, 3) from the lamp, and light (n, 3) from the ceiling, at points (n, 3)."""
         room, finger = self._room, instance == FINGER_ID
+        among_others = None
+        if shared is not None:  # no point of the finger represents another body, and the reverse
+            among_others = (np.cumsum(~finger) - 1)[shared[~finger]]
         lamp, sky = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)
         for light in room.lamp:
-            lamp += _cosine_to_light(self._stage, light, points.astype(float), normal)
+            lamp += _cosine_to_light(self._stage, light, points.astype(float), normal, shared)
         for light in room.sky:
             cosine = np.empty(len(points), np.float32)
             # Finger and arm are dark: shadows of the ceiling's light on them would be invisible.
             cosine[finger] = np.maximum(_dot(_unit(light - points[finger]), normal[finger]), 0.0)
-            cosine[~finger] = _cosine_to_light(self._stage, light, points[~finger].astype(float), normal[~finger])
+            cosine[~finger] = _cosine_to_light(
+                self._stage, light, points[~finger].astype(float), normal[~finger], among_others
+            )
             sky += cosine
         lamp, sky = lamp / np.float32(len(room.lamp)), sky / np.float32(len(room.sky))
         return lamp[:, None] * room.lamp_colour, sky[:, None] * room.sky_colour

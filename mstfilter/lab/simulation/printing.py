@@ -297,6 +297,20 @@ def glaze(
     return _tint(image, 0.015 * noise(rng, (h, w), (60, 60), 3))
 
 
+def plastic(rng: np.random.Generator, width: float, height: float, colour: _Rgb) -> np.ndarray:
+    """Painted or moulded plastic: one colour with faint scratches."""
+    image = _canvas(width, height, colour)
+    h, w = image.shape[:2]
+    return _tint(image, 0.012 * noise(rng, (h, w), (50, 50), 3) + 0.01 * noise(rng, (h, w), (3, 60), 1))
+
+
+def metal(rng: np.random.Generator, width: float, height: float, grey: int) -> np.ndarray:
+    """Brushed metal."""
+    image = _canvas(width, height, (grey, grey, min(255, grey + 3)))
+    h, w = image.shape[:2]
+    return _tint(image, 0.05 * noise(rng, (h, w), (2, 120), 2) + 0.05 * noise(rng, (h, w), (80, 80), 2))
+
+
 def peel(rng: np.random.Generator, width: float, height: float, colour: _Rgb) -> np.ndarray:
     """Fruit peel: one colour with brown freckles."""
     image = _canvas(width, height, colour)

@@ -23,11 +23,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 import warnings
 from collections.abc import Callable
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -40,10 +39,12 @@ from mstfilter.base.reading import check_private
 from mstfilter.formats import RecordingWriter, open_recording
 from mstfilter.lab.simulation.arrangement import SceneObjects, arrange_objects, draw_objects
 from mstfilter.lab.simulation.families import GENERATOR_VERSION, SceneFamily, scene_family
+from mstfilter.lab.simulation.groups import choose_group_push
 from mstfilter.lab.simulation.lighting import Stage
-from mstfilter.lab.simulation.renderer import Renderer, visible_texel
-from mstfilter.lab.simulation.sensor import DepthSensor, colour_reading
+from mstfilter.lab.simulation.renderer import Renderer, View, visible_texel
+from mstfilter.lab.simulation.sensor import colour_reading
 from mstfilter.lab.simulation.shapes import label_voxels
+from mstfilter.lab.simulation.surfaces import cache_folder
 from mstfilter.lab.simulation.textures import Room, draw_room
 from mstfilter.lab.simulation.world import (
     FINGER_ID,
@@ -77,9 +78,11 @@ class SimulatedScene:
         check_integer("seed", seed, at_least=0)
         self.family, self.seed = family, int(seed)
         self.camera, self.grid = family.camera(), family.grid()
-        self.objects: SceneObjects = draw_objects(stream(self.seed, "things"), family, family.pool(self.seed))
-        self.world = PhysicsWorld(self.objects.shapes, family.arm)
-        arrange_objects(stream(self.seed, "arrangement"), self.world, family, self.objects.twin_of)
+        pools = family.pool(self.seed), family.object_pool(self.seed)
+        self.objects: SceneObjects = draw_objects(stream(self.seed, "things"), family, *pools)
+        self.world = PhysicsWorld(self.objects.shapes, family.arm, self.objects.wall)
+        arrange_objects(stream(self.seed, "arrangement"), self.world, family, self.objects)
+        self.sensor = family.depth_sensor()
         self.room: Room = draw_room(stream(self.seed, "room"), visible_texel(self.camera))
         appearance = self.objects.skins, self.room
         self._renderer = Renderer(self.world, *appearance, self.camera, family.supersample, POSE_TOLERANCE)
@@ -91,7 +94,17 @@ class SimulatedScene:
 
     def choose_push(self, action: int) -> FingerPush:
         """Choose the push of action number `action` from the current state."""
-        return choose_push(stream(self.seed, "push", action), self.world, self.family)
+        rng = stream(self.seed, "push", action)
+        if aim := self.push_aim(action):
+            return choose_group_push(rng, self.world, self.family, self.objects.groups, aim)
+        return choose_push(rng, self.world, self.family)
+
+    def push_aim(self, action: int) -> str:
+        """The aim of the push of an action, one of `PUSH_AIMS`; empty if pushes do not heed groups."""
+        aims = self.family.aims()
+        if not aims or not self.objects.groups:
+            return ""
+        return aims[int(stream(self.seed, "aim", action).integers(len(aims)))]
 
     def play(self, push: FingerPush, on_frame: Callable[[float], None]) -> PushEffect:
         """Simulate a push from one pause to the next. ``on_frame(time)`` is called for each frame."""
@@ -108,10 +121,14 @@ class SimulatedScene:
         view = self._renderer.render()
         return {
             "rgb": colour_reading(stream(self.seed, "colour", frame), view.colour * self.room.exposure),
-            "depth": DepthSensor().read(stream(self.seed, "depth", frame), view.depth, view.slant),
+            "depth": self._depth(stream(self.seed, "depth", frame), view),
             "instance": view.instance,
             "robot_mask": view.instance == FINGER_ID,
         }
+
+    def _depth(self, rng: np.random.Generator, view: View) -> np.ndarray:
+        materials = (view.reflectance, view.shine) if self.sensor.sees_materials else ()
+        return self.sensor.read(rng, view.depth, view.slant, *materials)
 
     def truth(self) -> np.ndarray:
         """True labels (X, Y, Z) uint16 of the current state."""
@@ -139,8 +156,9 @@ class SimulatedScene:
             "generator": "mstfilter.lab.simulation",
             "generator_version": GENERATOR_VERSION,
             "seed": self.seed,
-            "family": asdict(self.family),
+            "family": self.family.described(),
             "objects": objects,
+            **({"groups": [group.describe() for group in self.objects.groups]} if self.objects.groups else {}),
         }
 
 
@@ -169,6 +187,8 @@ def simulate_recording(
 
             push = scene.choose_push(action)
             description = _describe_push(push, scene.play(push, record))
+            if aim := scene.push_aim(action):
+                description["aim"] = aim
             index += 1
             _record_pause(scene, writer, index, scene.world.time - start, action=action, push=description)
             report(index + 1, family.n_frames, f"pause {action + 1}")
@@ -204,19 +224,12 @@ def _describe_push(push: FingerPush, result: PushEffect) -> dict[str, Any]:
     }
 
 
-def cache_folder() -> Path:
-    """Folder of cached files: the variable MSTFILTER_CACHE, or else `mstfilter` in the user's cache folder."""
-    if folder := os.environ.get("MSTFILTER_CACHE"):
-        return Path(folder)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mstfilter"
-
-
 def recipe_key(family: SceneFamily, seed: int) -> str:
     """A hash of all values that determine a recording: the family, the seed and the software versions."""
     recipe = {
         "generator": GENERATOR_VERSION,
         "mujoco": version("mujoco"),
-        "family": asdict(family),
+        "family": family.described(),
         "seed": int(seed),
     }
     return hashlib.sha256(json.dumps(recipe, sort_keys=True).encode()).hexdigest()[:16]

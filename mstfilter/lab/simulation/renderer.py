@@ -14,9 +14,10 @@ import numpy as np
 from mstfilter.lab.simulation.lighting import SHADOW_GROUPS, BodyColours, LightMap, Stage
 from mstfilter.lab.simulation.sensor import NEIGHBOURS
 from mstfilter.lab.simulation.textures import Atlas, Room, Skin
-from mstfilter.lab.simulation.world import FINGER_GROUP, OBJECT_GROUP, ROOM_GROUP, TABLE, PhysicsWorld
+from mstfilter.lab.simulation.world import FINGER_GROUP, MESH_GROUP, OBJECT_GROUP, ROOM_GROUP, TABLE, PhysicsWorld
 from mstfilter.scene import Camera
 
+_BLOCK = 3  # side of the blocks of pixels that share shadow rays in worlds with meshes
 _OFFSETS = ((-0.34, 0.14), (0.34, -0.14))  # of further rays within a pixel on an edge: rows, columns
 
 
@@ -28,6 +29,8 @@ class View:
     depth: np.ndarray  #: (H, W) float32 metres, z-depth of the first surface; NaN for none
     instance: np.ndarray  #: (H, W) uint8, 0 for the room, 1 .. n for objects, 255 for finger and arm
     slant: np.ndarray  #: (H, W) float32, cosine between the surface's normal and the ray
+    reflectance: np.ndarray  #: (H, W) float32, share of light that the surface reflects
+    shine: np.ndarray  #: (H, W) float32, strength of the highlight of a lamp at the camera, 0 .. 1
 
 
 def visible_texel(camera: Camera) -> float:
@@ -53,13 +56,15 @@ class Renderer:
     ) -> None:
         self.room, self.camera = room, camera
         self.stage = Stage(world, tolerance)
-        atlas = Atlas(list(skins), visible_texel(camera))
+        atlas = Atlas([one for skin in skins for one in skin.surfaces], visible_texel(camera))
         turn = camera.pose.as_matrix()[:3, :3]
         self._eye = np.array(camera.position)
         self._rays = camera.rays().reshape(-1, 3) @ turn.T
         self._unit = (self._rays / np.linalg.norm(self._rays, axis=1)[:, None]).astype(np.float32)
         K = camera.K
         shifts = [np.array([du / K[0, 0], dv / K[1, 1], 0.0]) @ turn.T for dv, du in _OFFSETS]
+        rows, columns = np.indices((camera.height, camera.width)) // _BLOCK
+        self._block = (rows * camera.width + columns).ravel()
         self._further = [self._rays + shift for shift in shifts] if supersample else []
         self._bodies = BodyColours(self.stage, atlas, room, self._eye)
         self._render_background()
@@ -76,6 +81,7 @@ class Renderer:
         self._room_albedo = self._room_colours(geom, points, normal)
         self._on_table = (geom == 0) & (normal[:, 2] > 0.5)
         self._room_light = self._unshadowed_light(points, normal)
+        self._room_reflectance = self._room_albedo.mean(axis=1)
         self._table_xy = points[self._on_table, :2]
 
     def _slant(self, pixels: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -135,22 +141,24 @@ class Renderer:
         depth[hit], normal[hit] = z[hit], facing[hit]
         slant[hit] = self._slant(hit, facing[hit])
         points = self._eye + self._rays[hit] * z[hit, None]
-        colour[hit] = self._bodies.at(geom[hit], points, facing[hit])
+        reflectance, shine = self._room_reflectance.copy(), np.zeros(h * w, np.float32)
+        colour[hit], reflectance[hit], shine[hit] = self._bodies.at(geom[hit], points, facing[hit], self._block[hit])
         if self._further:
             edge = _edge_pixels(instance.reshape(h, w), normal.reshape(h, w, 3))
             total = np.zeros((len(edge), 3), np.float32)
             for rays in self._further:
-                total += self._colours(rays[edge])
+                total += self._colours(rays[edge], self._block[edge])
             colour[edge] = (colour[edge] + total) / np.float32(1 + len(self._further))
-        return View(colour.reshape(h, w, 3), depth.reshape(h, w), instance.reshape(h, w), slant.reshape(h, w))
+        images = (image.reshape(h, w) for image in (depth, instance, slant, reflectance, shine))
+        return View(colour.reshape(h, w, 3), *images)
 
-    def _colours(self, rays: np.ndarray) -> np.ndarray:
-        """Colours (k, 3) of the surfaces that rays (k, 3) hit."""
-        geom, z, normal = self.stage.cast(self._eye, rays, (ROOM_GROUP, OBJECT_GROUP, FINGER_GROUP))
+    def _colours(self, rays: np.ndarray, block: np.ndarray) -> np.ndarray:
+        """Colours (k, 3) of the surfaces that rays (k, 3) of pixels in blocks (k,) hit."""
+        geom, z, normal = self.stage.cast(self._eye, rays, (ROOM_GROUP, OBJECT_GROUP, FINGER_GROUP, MESH_GROUP))
         points = self._eye + rays * z[:, None]
         result = np.empty((len(rays), 3), np.float32)
         body = (geom >= 0) & (self.stage.world.geom_object[geom] > 0)
-        result[body] = self._bodies.at(geom[body], points[body], normal[body])
+        result[body] = self._bodies.at(geom[body], points[body], normal[body], block[body])[0]
         geom, points, normal = geom[~body], points[~body], normal[~body]
         albedo, light = self._room_colours(geom, points, normal), self._unshadowed_light(points, normal)
         table = (geom == 0) & (normal[:, 2] > 0.5)

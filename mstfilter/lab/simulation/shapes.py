@@ -1,4 +1,4 @@
-"""Household objects made of convex pieces: shapes, sizes and voxels.
+"""Household objects: shapes, sizes and voxels.
 
 `draw_shape(rng, family)` returns a `Shape` with convex pieces in body axes, rest poses, mass and texture layout. The
 origin of the body axes is the middle of the bounding box. In the upright pose, the z axis points up.
@@ -15,7 +15,20 @@ gelatin, cans of soup, tuna and coffee, mug, bowl, banana and ball are from the 
 (0.25 m in the YCB set). Each length is scaled at random by up to 10 %. The walls of bowl and mug are 1 cm thick, as a
 thinner wall could lie between the centres of 1 cm voxels.
 
-`label_voxels` returns the true volume: all voxels of each object, visible or not.
+A `Shape` can also be a mesh (`Shape.of_surface`), or several shapes that are one rigid body (`Shape.of_parts`), such
+as a pack of cans.
+
+`label_voxels` returns the true volume: all voxels of each object, visible or not. A voxel belongs to an object if
+
+- its centre is inside the object, or
+- a wall thinner than a voxel passes through it: let f be the share of the voxel that is inside, and F the largest
+  share of a cube of the same size that contains the voxel's centre. The wall is thin if F < 0.7, and the voxel
+  belongs to the object if also f >= 0.48 F.
+
+Across a plane wall of any thickness, the second rule gives a layer of about one voxel (with 0.5, exactly one), so a
+thin wall has no holes, and solid objects keep their volume. The inside of a mesh is a matter of the parity of rays
+(`surfaces`). No wall of the objects that are made of pieces is thinner than 0.7 voxels of 1 cm, so for them the first
+rule decides, and the second is not evaluated. With larger voxels, the walls of bowls and mugs may have holes.
 
 >>> from mstfilter.scene import VoxelGrid
 >>> from mstfilter.lab.simulation.shapes import label_voxels
@@ -35,7 +48,8 @@ from itertools import pairwise
 import numpy as np
 
 from mstfilter.base.errors import InputError
-from mstfilter.lab.simulation.solids import Piece, box, capsule, cylinder, ellipsoid, frustum, hull, ring
+from mstfilter.lab.simulation.solids import Piece, box, capsule, cylinder, ellipsoid, frustum, hull, placed, ring
+from mstfilter.lab.simulation.surfaces import MeshSurface
 from mstfilter.scene import VoxelGrid
 
 _SMALLEST, _BAND = 0.90, 0.025
@@ -44,6 +58,9 @@ _SIZE_BANDS = ((0, 3, 4, 7), (1, 2, 5, 6))
 _N_HUES = 12
 _MARGIN = 0.04  # share of a band that is left free at either side
 
+_THIN = 0.7  # a wall is thin where no cube of the size of a voxel is filled to this share
+_HALF = 0.48  # share of the largest share; at a half, a plane wall is one voxel thick, and rounding makes holes
+_FINE = 4  # points a voxel and axis, for shares of volume
 _WALL = 0.010  # thickness of the walls of bowl and mug, metres
 
 # Rest poses: which body axis points up (sign * (axis + 1)).
@@ -106,15 +123,60 @@ class Shape:
     finish: tuple[str, ...]  #: styles of texture that suit the object
     rolling: float = 0.0005  #: rolling friction, metres
 
+    surface: MeshSurface | None = None  #: the mesh of an object that is not just its pieces
+    scale: float = 1.0  #: size of the object divided by the size of the mesh
+    parts: tuple[Part, ...] = ()  #: shapes that are one body
+
     half: np.ndarray = field(init=False)  #: Half edges (3,) of the bounding box, metres
 
     def __post_init__(self) -> None:
+        if self.surface is not None:
+            object.__setattr__(self, "half", self.scale * self.surface.half)
+            return
         bounds = [piece.bounds() for piece in self.pieces]
+        if self.parts:
+            bounds = [part.bounds() for part in self.parts]
         lower, upper = np.min([b[0] for b in bounds], axis=0), np.max([b[1] for b in bounds], axis=0)
         middle = (lower + upper) / 2
         moved = tuple(replace(piece, centre=piece.centre - middle) for piece in self.pieces)
         object.__setattr__(self, "pieces", moved)
         object.__setattr__(self, "half", (upper - lower) / 2)
+        parts = tuple(replace(part, position=part.position - middle) for part in self.parts)
+        object.__setattr__(self, "parts", parts)
+
+    @classmethod
+    def of_surface(
+        cls, surface: MeshSurface, scale: float, family: str, name: str, mass: float, finish: tuple[str, ...]
+    ) -> Shape:
+        """The shape of a mesh, `scale` times as large as the mesh."""
+        pieces = tuple(placed(piece, np.eye(3), np.zeros(3), scale) for piece in surface.pieces)
+        print_as = "lathe" if finish[0] in ("label", "ceramic") else "box"
+        rolling = 0.004
+        return cls(family, name, pieces, mass, print_as, ((_UP_Z, 1.0),), finish, rolling, surface, scale)
+
+    @classmethod
+    def of_parts(cls, family: str, name: str, parts: Sequence[Part]) -> Shape:
+        """Several shapes that are one rigid body."""
+        pieces = [placed(p, part.rotation, part.position) for part in parts for p in part.shape.pieces]
+        mass, finish = sum(part.shape.mass for part in parts), parts[0].shape.finish
+        return cls(family, name, pieces, mass, "box", ((_UP_Z, 1.0),), finish, parts=tuple(parts))
+
+    @property
+    def surfaces(self) -> tuple[Part, ...]:
+        """The shapes with textures of their own: the parts of a body of several parts, or the shape itself."""
+        return self.parts or (Part(self, np.eye(3), np.zeros(3)),)
+
+    @cached_property
+    def corners(self) -> np.ndarray:
+        """Points (n, 3) in body axes whose convex hull contains the object."""
+        if self.parts:
+            return np.concatenate([p.shape.corners @ p.rotation.T + p.position for p in self.parts])
+        if self.surface is not None:
+            from scipy.spatial import ConvexHull
+
+            vertices = self.scale * self.surface.vertices
+            return np.asarray(vertices[ConvexHull(vertices).vertices])
+        return np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T * self.half
 
     @property
     def radius(self) -> float:
@@ -130,6 +192,16 @@ class Shape:
         """(...) bool: whether points (..., 3) in body axes are in the object."""
         points = np.asarray(points)
         found = np.zeros(points.shape[:-1], bool)
+        if self.parts:
+            for part in self.parts:
+                found |= part.shape.inside((points - part.position) @ part.rotation)
+            return found
+        if self.surface is not None:
+            volume = self.surface.inside
+            index = np.floor((points / self.scale - volume.origin) / volume.cell).astype(np.int64)
+            valid = ((index >= 0) & (index < volume.share.shape)).all(axis=-1)
+            found[valid] = volume.share[tuple(index[valid].T)] >= 0.5
+            return found
         for piece in self.pieces:
             lower, upper = piece.bounds()
             near = ~found & (points >= lower - 1e-6).all(axis=-1) & (points <= upper + 1e-6).all(axis=-1)
@@ -137,25 +209,87 @@ class Shape:
         return found
 
 
-def label_voxels(shapes: Sequence[Shape], poses: np.ndarray, grid: VoxelGrid) -> np.ndarray:
-    """Labels (X, Y, Z) uint16: k + 1 if the centre of the voxel lies in shape k, and 0 for other voxels.
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A shape in a body of several parts."""
 
-    `poses` (n, 4, 4) are T_world_object. Objects at rest overlap by less than a millimetre. If a voxel centre lies in
-    two objects, the voxel gets the label of the first object.
+    shape: Shape
+    rotation: np.ndarray  #: (3, 3) columns are the axes of the part in the body
+    position: np.ndarray  #: (3,) metres: origin of the part in the body
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Minimum and maximum corner of a box in the body's frame that contains the part."""
+        reach = np.abs(self.rotation) @ self.shape.half
+        return self.position - reach, self.position + reach
+
+
+def label_voxels(shapes: Sequence[Shape], poses: np.ndarray, grid: VoxelGrid) -> np.ndarray:
+    """Labels (X, Y, Z) uint16: k + 1 for the voxels of shape k (see the definition above), and 0 for other voxels.
+
+    `poses` (n, 4, 4) are T_world_object. Objects at rest overlap by less than a millimetre. A voxel of two objects
+    gets the label of the object that has its centre, and otherwise of the first object.
     """
     labels = np.zeros(grid.shape, np.uint16)
-    for k, (shape, pose) in enumerate(zip(shapes, poses, strict=True)):
-        reach = np.abs(pose[:3, :3]) @ shape.half + grid.voxel_size
-        low = np.maximum(grid.index_of(pose[:3, 3] - reach), 0)
-        high = np.minimum(grid.index_of(pose[:3, 3] + reach) + 1, grid.shape)
-        if (high <= low).any():
-            continue
-        block = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
-        index = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high, strict=True)), indexing="ij"), -1)
-        local = (grid.centre_of(index) - pose[:3, 3]) @ pose[:3, :3]
-        free = labels[block] == 0
-        labels[block][free & shape.inside(local)] = k + 1
+    thin: list[tuple[tuple[slice, ...], np.ndarray, int]] = []
+    for k, (whole, pose) in enumerate(zip(shapes, poses, strict=True)):
+        for part in whole.surfaces:
+            turn = pose[:3, :3] @ part.rotation if whole.parts else pose[:3, :3]
+            at = pose[:3, 3] + pose[:3, :3] @ part.position if whole.parts else pose[:3, 3]
+            reach = np.abs(turn) @ part.shape.half + grid.voxel_size
+            low = np.maximum(grid.index_of(at - reach), 0)
+            high = np.minimum(grid.index_of(at + reach) + 1, grid.shape)
+            if (high <= low).any():
+                continue
+            block = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+            labels[block][(labels[block] == 0) & _centres_inside(part.shape, turn, at, grid, low, high)] = k + 1
+            if part.shape.surface is not None:
+                thin.append((block, _thin_walls(part.shape, turn, at, grid, low, high), k))
+    for block, walls, k in thin:
+        labels[block][(labels[block] == 0) & walls] = k + 1
     return labels
+
+
+def _centres_inside(
+    shape: Shape, turn: np.ndarray, at: np.ndarray, grid: VoxelGrid, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """Which voxels from index `low` (3,) to `high` (3,) have their centres in a shape with pose (turn, at)."""
+    if shape.surface is not None:
+        first = turn.T @ (grid.centre_of(low) - at) / shape.scale
+        step = grid.voxel_size / shape.scale
+        return shape.surface.inside.resampled(first, turn.T, step, tuple(high - low)) >= 0.5
+    index = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high, strict=True)), indexing="ij"), -1)
+    return shape.inside((grid.centre_of(index) - at) @ turn)
+
+
+def _filled(
+    shape: Shape, turn: np.ndarray, at: np.ndarray, origin: np.ndarray, step: float, size: tuple[int, ...]
+) -> np.ndarray:
+    """How far a raster of points (size) from `origin` (3,) on, in world axes, is inside a shape: 0 .. 1, float32."""
+    if shape.surface is not None:
+        first = turn.T @ (origin - at) / shape.scale
+        return shape.surface.inside.resampled(first, turn.T, step / shape.scale, size, blur=True)
+    filled = np.empty(size, np.float32)
+    for i in range(size[0]):
+        plane = np.stack(np.meshgrid([i], np.arange(size[1]), np.arange(size[2]), indexing="ij"), -1)
+        filled[i : i + 1] = shape.inside((origin + step * plane - at) @ turn)
+    return filled
+
+
+def _thin_walls(
+    shape: Shape, turn: np.ndarray, at: np.ndarray, grid: VoxelGrid, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """Which voxels from index `low` (3,) to `high` (3,) a thin wall passes through."""
+    from scipy.ndimage import maximum_filter, uniform_filter
+
+    step = grid.voxel_size / _FINE
+    first = grid.centre_of(low - 1) - (_FINE - 1) / 2 * step
+    size = tuple(int(n) for n in (high - low + 2) * _FINE)
+    # Entry i is the share of the cube of the points i .. i + 3, which is voxel low - 1 for i = 0.
+    share = uniform_filter(_filled(shape, turn, at, first, step, size), _FINE, mode="constant", origin=-_FINE // 2)
+    most = maximum_filter(share, _FINE + 1)
+    voxels = tuple(slice(_FINE, -_FINE, _FINE) for _ in range(3))
+    f, largest = share[voxels], most[voxels]
+    return (largest < _THIN) & (f >= _HALF * largest) & (f > 0.01)
 
 
 def _choose(rng: np.random.Generator, table: Mapping[str, tuple[float, ...]]) -> tuple[str, tuple[float, ...]]:
@@ -274,6 +408,24 @@ def _banana(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
     thick = 0.018 * np.array([0.62, 0.88, 1.0, 1.0, 1.0, 0.88, 0.62])
     pieces = [capsule(a, b, r) for a, b, r in zip(path, path[1:], thick, strict=False)]
     return Shape("banana", "banana", pieces, 0.12, "box", ((_UP_Z, 1.0),), ("peel",), rolling=0.002)
+
+
+def board(rng: np.random.Generator) -> Shape:
+    """A cutting board."""
+    half = (float(rng.uniform(0.14, 0.19)), float(rng.uniform(0.10, 0.13)), float(rng.uniform(0.006, 0.011)))
+    return Shape(
+        "board", "board", [box(half)], 5000 * float(np.prod(half)), "box", ((_UP_Z, 1.0),), ("wood", "plain")
+    )
+
+
+def tray(rng: np.random.Generator) -> Shape:
+    """A tray with a rim."""
+    x, y, z = float(rng.uniform(0.15, 0.20)), float(rng.uniform(0.11, 0.14)), float(rng.uniform(0.014, 0.022))
+    wall = 0.005  # half of the thickness of floor and rim, metres
+    pieces = [box((x, y, wall), (0, 0, wall))]
+    pieces += [box((x, wall, z - wall), (0, s * (y - wall), z + wall)) for s in (-1, 1)]
+    pieces += [box((wall, y - 2 * wall, z - wall), (s * (x - wall), 0, z + wall)) for s in (-1, 1)]
+    return Shape("tray", "tray", pieces, 0.7, "box", ((_UP_Z, 1.0),), ("wood", "plain"))
 
 
 _MAKERS: dict[str, Callable[[np.random.Generator, Callable[[], float]], Shape]] = {

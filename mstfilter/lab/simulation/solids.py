@@ -30,7 +30,7 @@ class Piece:
     #: axis. Empty for a hull.
     size: tuple[float, ...]
     centre: np.ndarray  #: (3,) metres: origin of the piece's frame in the body
-    rotation: np.ndarray  #: (3, 3) columns are the axes of the piece's frame in the body. Only capsules are turned
+    rotation: np.ndarray  #: (3, 3) columns are the axes of the piece's frame in the body
     vertices: np.ndarray | None = None  #: (n, 3) metres: of a hull, in the piece's frame
     plain: bool = False  #: whether the piece has one colour (a handle) instead of the body's texture
 
@@ -72,17 +72,27 @@ class Piece:
         return float(self._hull.volume)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Minimum and maximum corner of the bounding box in the body's frame."""
+        """Minimum and maximum corner of a box in the body's frame that contains the piece.
+
+        The box is the smallest, except for turned cylinders and ellipsoids.
+        """
         if self.kind == "hull":
-            corners = self.vertices + self.centre
+            corners = np.asarray(self.vertices) @ self.rotation.T + self.centre
             return corners.min(axis=0), corners.max(axis=0)
         if self.kind == "capsule":
             reach = self.size[0] + np.abs(self.rotation[:, 2]) * self.size[1]
         elif self.kind == "cylinder":
-            reach = np.array([self.size[0], *self.size])
+            reach = np.abs(self.rotation) @ np.array([self.size[0], *self.size])
         else:
-            reach = np.array(self.size)
+            reach = np.abs(self.rotation) @ np.array(self.size)
         return self.centre - reach, self.centre + reach
+
+
+def placed(piece: Piece, rotation: np.ndarray, position: np.ndarray, scale: float = 1.0) -> Piece:
+    """The piece in a larger body, turned by `rotation` (3, 3) and shifted by `position` (3,)."""
+    vertices = None if piece.vertices is None else piece.vertices * scale
+    size, centre = tuple(scale * s for s in piece.size), rotation @ (scale * piece.centre) + position
+    return Piece(piece.kind, size, centre, rotation @ piece.rotation, vertices, piece.plain)
 
 
 def _upright(kind: str, size: tuple[float, ...], at: ArrayLike) -> Piece:

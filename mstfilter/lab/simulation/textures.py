@@ -37,13 +37,20 @@ class Skin:
     """Texture of a body: flat images (h, w, 3) uint8, called charts, and the strength of the highlight, 0 .. 1.
 
     Charts show six faces (-x, +x, -y, +y, -z, +z) or side, top, bottom and inside. The last chart has one colour.
+    A body of several parts has a texture for each part.
     """
 
     charts: tuple[np.ndarray, ...]
     gloss: float
+    parts: tuple[Skin, ...] = ()
+
+    @property
+    def surfaces(self) -> tuple[Skin, ...]:
+        """The textures in the order of `Shape.surfaces`."""
+        return self.parts or (self,)
 
 
-def _linear(image: np.ndarray) -> np.ndarray:
+def linear_light(image: np.ndarray) -> np.ndarray:
     """Linear intensity 0 .. 1, float32, of an sRGB image."""
     value = image.astype(np.float32) / 255.0
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
@@ -104,7 +111,7 @@ def draw_skin(rng: np.random.Generator, shape: Shape, pool: Pool = ANY) -> Skin:
     sizes = _chart_sizes(shape)
     pair = (printing.shade(rng, pool=pool), printing.shade(rng, (0.55, 0.95), 0.65, pool))
     words = printing.brand(rng, pool)
-    gloss = {"label": 0.30, "ceramic": 0.35, "carton": 0.12}.get(style, 0.04)
+    gloss = {"label": 0.30, "ceramic": 0.35, "carton": 0.12, "plain": 0.15, "metal": 0.40}.get(style, 0.04)
     if style == "carton":
         # Front and back are on the two broadest upright faces, the sides on the narrow ones.
         wide = sorted(range(4), key=lambda k: -sizes[k][0])[:2]
@@ -134,6 +141,13 @@ def draw_skin(rng: np.random.Generator, shape: Shape, pool: Pool = ANY) -> Skin:
         for w, h in sizes:
             rng.bit_generator.state = state  # every face has the same weave
             charts.append(printing.cloth(rng, w, h, pool))
+    elif style == "plain":
+        # Handles, toys and tools: dark tones are as frequent as light ones.
+        tone = printing.shade(rng, (0.08, 0.5) if rng.uniform() < 0.5 else (0.4, 0.95), 0.8, pool)
+        charts = [printing.plastic(rng, w, h, tone) for w, h in sizes]
+    elif style == "metal":
+        grey = int(rng.uniform(95, 175))
+        charts = [printing.metal(rng, w, h, grey) for w, h in sizes]
     elif style == "peel":
         ripe = (int(rng.uniform(205, 228)), int(rng.uniform(175, 195)), int(rng.uniform(60, 95)))
         charts = [printing.peel(rng, w, h, ripe) for w, h in sizes]
@@ -144,6 +158,26 @@ def draw_skin(rng: np.random.Generator, shape: Shape, pool: Pool = ANY) -> Skin:
     colour = charts[_INSIDE][0, 0] if style == "ceramic" else charts[0].reshape(-1, 3).mean(axis=0)
     plain = np.broadcast_to(colour.astype(np.uint8), (2, 2, 3))
     return Skin((*charts, plain), gloss)
+
+
+def sliced(skin: Skin, axis: int, n: int) -> list[Skin]:
+    """The texture of a box cut into n boxes of equal length along a body axis, from the lowest to the highest.
+
+    The cut faces have the textures of the ends.
+    """
+    pieces: list[list[np.ndarray]] = [[] for _ in range(n)]
+    for face in range(6):
+        right, up = _face_axes(face)
+        chart = skin.charts[face]
+        if face // 2 == axis:
+            parts = [chart] * n
+        elif right[axis]:
+            parts = np.array_split(chart, n, axis=1)[:: int(np.sign(right[axis]))]
+        else:
+            parts = np.array_split(chart, n, axis=0)[:: -int(np.sign(up[axis]))]
+        for piece, part in zip(pieces, parts, strict=True):
+            piece.append(np.ascontiguousarray(part))
+    return [Skin((*charts, skin.charts[-1]), skin.gloss) for charts in pieces]
 
 
 class Atlas:
@@ -163,7 +197,7 @@ class Atlas:
             texels.append(chart)
         self._height, self._width = np.array([chart.shape[:2] for chart in texels]).T
         self._first = np.cumsum([0, *(self._height * self._width)[:-1]])
-        self._texels = _linear(np.concatenate([chart.reshape(-1, 3) for chart in texels]))
+        self._texels = linear_light(np.concatenate([chart.reshape(-1, 3) for chart in texels]))
 
     def colour(self, skin: int, chart: np.ndarray, place: np.ndarray) -> np.ndarray:
         """Linear albedo (n, 3) float32 of a texture, interpolated at the coordinates `place` (n, 2)."""
@@ -213,7 +247,7 @@ def _table_top(rng: np.random.Generator, texel: float) -> np.ndarray:
 
 def draw_room(rng: np.random.Generator, texel: float) -> Room:
     """Draw the surroundings of a scene. `texel` is the pixel size of the table's texture in metres."""
-    table = _linear(_table_top(rng, texel))
+    table = linear_light(_table_top(rng, texel))
     side = -1.0 if rng.uniform() < 0.5 else 1.0
     centre = np.array([side * rng.uniform(0.35, 0.8), rng.uniform(-0.7, 0.1), rng.uniform(1.3, 1.7)])
     spread = rng.uniform(0.08, 0.14)

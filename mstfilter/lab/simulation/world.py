@@ -9,8 +9,9 @@
 True
 
 The time step is 2 ms, the integrator is implicit, and friction cones are elliptic. Objects are unions of convex
-pieces with torsional and rolling friction. The finger is a capsule on three slides with stiff position actuators. The
-arm above the finger is visible but has no contacts.
+pieces with torsional and rolling friction. Rays hit the mesh of an object that has one, and the pieces of others. The
+finger is a capsule on three slides with stiff position actuators. The arm above the finger is visible but has no
+contacts.
 
 An action is a `FingerPush`: the finger comes down, moves in a straight line, and goes up and away. `choose_push`
 simulates dozens of candidate pushes from one state, and takes the first push that moves enough objects and neither
@@ -28,7 +29,7 @@ from numpy.typing import ArrayLike
 
 from mstfilter.base.errors import InputError
 from mstfilter.lab.simulation.families import SceneFamily
-from mstfilter.lab.simulation.shapes import Shape
+from mstfilter.lab.simulation.shapes import Part, Shape
 from mstfilter.lab.simulation.solids import Piece
 from mstfilter.scene import VoxelGrid
 
@@ -39,6 +40,7 @@ TABLE = ((0.85, 0.66, 0.02), (0.0, 0.04, -0.02))  #: Half edges and centre of th
 FLOOR_HEIGHT = -0.72
 
 ROOM_GROUP, OBJECT_GROUP, FINGER_GROUP = 0, 1, 2  #: Groups of geoms that rays can be limited to
+PIECE_GROUP, MESH_GROUP = 3, 4  #: Pieces of objects with a mesh (not visible, but cheap for rays), and meshes
 
 _TIME_STEP = 0.002
 _WALL_DISTANCE = 1.9
@@ -46,6 +48,9 @@ _PARKED = np.array([0.0, -4.0, 1.0])  # the finger between actions: behind the c
 _FINGER_RADIUS = 0.011
 _FINGER_HALF = 0.10
 _CONTACT_GAP = 0.0005  # nearer pairs are contacts (without force): bodies at rest touch up to solver noise
+# conaffinity 4 matches no contype, so a visible geom touches nothing. MuJoCo's rays skip the bounding volumes of
+# geoms with contype = conaffinity = 0.
+_VISIBLE = 'contype="0" conaffinity="4" mass="0"'
 _AWAY = 50.0  # where objects are before they are placed
 
 # Height of the middle of the finger while it pushes (its tip is 12 mm above the table), and before and after.
@@ -60,7 +65,7 @@ def _numbers(values: ArrayLike | None) -> str:
     return " ".join(repr(float(v)) for v in np.asarray(values).ravel())
 
 
-def _geom_xml(piece: Piece, mesh: str, density: float, rolling: float) -> str:
+def _geom_xml(piece: Piece, mesh: str, density: float, rolling: float, group: int) -> str:
     from scipy.spatial.transform import Rotation
 
     quaternion = Rotation.from_matrix(piece.rotation).as_quat(scalar_first=True)
@@ -69,27 +74,51 @@ def _geom_xml(piece: Piece, mesh: str, density: float, rolling: float) -> str:
     )
     return (
         f'<geom {solid} pos="{_numbers(piece.centre)}" quat="{_numbers(quaternion)}" density="{density!r}" '
-        f'group="{OBJECT_GROUP}" gap="{_CONTACT_GAP}" condim="{6 if rolling > 0.0005 else 4}" '
+        f'group="{group}" gap="{_CONTACT_GAP}" condim="{6 if rolling > 0.0005 else 4}" '
         f'friction="0.55 0.01 {rolling!r}"/>'
     )
 
 
-def _model_xml(shapes: Sequence[Shape], arm: bool) -> str:
+def _surface_xml(part: Part, name: str) -> tuple[str, str]:
+    """The mesh and the geom of the surface of a part, which rays hit."""
+    from scipy.spatial.transform import Rotation
+
+    surface = part.shape.surface
+    assert surface is not None
+    faces = " ".join(map(str, surface.faces.ravel().tolist()))
+    vertices = part.shape.scale * surface.vertices
+    quaternion = Rotation.from_matrix(part.rotation).as_quat(scalar_first=True)
+    return (
+        f'<mesh name="{name}" vertex="{_numbers(vertices)}" face="{faces}" inertia="shell"/>',
+        f'<geom type="mesh" mesh="{name}" pos="{_numbers(part.position)}" quat="{_numbers(quaternion)}" {_VISIBLE} '
+        f'group="{MESH_GROUP}"/>',
+    )
+
+
+def _model_xml(shapes: Sequence[Shape], arm: bool, wall: Wall | None) -> str:
     meshes, bodies = [], []
     for i, shape in enumerate(shapes):
         geoms = []
-        for j, piece in enumerate(shape.pieces):
+        groups = [
+            OBJECT_GROUP if part.shape.surface is None else PIECE_GROUP
+            for part in shape.surfaces
+            for _ in part.shape.pieces
+        ]
+        for j, (piece, group) in enumerate(zip(shape.pieces, groups, strict=True)):
             name = f"m{i}_{j}"
             if piece.kind == "hull":
                 meshes.append(f'<mesh name="{name}" vertex="{_numbers(piece.vertices)}" inertia="convex"/>')
-            geoms.append(_geom_xml(piece, name, float(shape.density), shape.rolling))
+            geoms.append(_geom_xml(piece, name, float(shape.density), shape.rolling, group))
+        for j, part in enumerate(shape.surfaces):
+            if part.shape.surface is not None:
+                mesh, geom = _surface_xml(part, f"s{i}_{j}")
+                meshes.append(mesh)
+                geoms.append(geom)
         at = _numbers((_AWAY + 2.0 * i, 0.0, 1.0))
         bodies.append(f'<body name="o{i}" pos="{at}"><freejoint/>{"".join(geoms)}</body>')
     axes = zip("xyz", ("1 0 0", "0 1 0", "0 0 1"), strict=True)
     slides = "".join(f'<joint name="{name}" type="slide" axis="{axis}"/>' for name, axis in axes)
-    # conaffinity 4 matches no contype, so the arm touches nothing. MuJoCo's rays skip the bounding volumes of geoms
-    # with contype = conaffinity = 0.
-    visible = f'contype="0" conaffinity="4" mass="0" group="{FINGER_GROUP}"'
+    visible = f'{_VISIBLE} group="{FINGER_GROUP}"'
     limbs = ""
     if arm:
         limbs = (
@@ -99,6 +128,14 @@ def _model_xml(shapes: Sequence[Shape], arm: bool) -> str:
     motors = "".join(f'<position joint="{a}" kp="2500" kv="70.710678"/>' for a in "xyz")
     half, middle = TABLE
     room = f'group="{ROOM_GROUP}"'
+    near = (
+        ""
+        if wall is None
+        else (
+            f'<geom type="box" size="{_numbers(wall.half)}" pos="{_numbers(wall.centre)}" {room} condim="4" '
+            f'friction="0.5 0.01 0.0005"/>'
+        )
+    )
     return f"""<mujoco>
 <compiler angle="radian"/>
 <option timestep="{_TIME_STEP}" integrator="implicitfast" cone="elliptic" impratio="5"/>
@@ -106,7 +143,7 @@ def _model_xml(shapes: Sequence[Shape], arm: bool) -> str:
 <worldbody>
 <geom type="box" size="{_numbers(half)}" pos="{_numbers(middle)}" {room} condim="4" friction="0.6 0.01 0.0005"/>
 <geom type="plane" size="0 0 1" pos="0 0 {FLOOR_HEIGHT}" {room} contype="0" conaffinity="0"/>
-<geom type="plane" size="0 0 1" pos="0 {_WALL_DISTANCE} 0" zaxis="0 -1 0" {room} contype="0" conaffinity="0"/>
+<geom type="plane" size="0 0 1" pos="0 {_WALL_DISTANCE} 0" zaxis="0 -1 0" {room} contype="0" conaffinity="0"/>{near}
 <body name="finger" gravcomp="1">{slides}
 <geom type="capsule" size="{_FINGER_RADIUS} {_FINGER_HALF}" mass="0.5" group="{FINGER_GROUP}" condim="4"
  friction="0.55 0.01 0.0005"/>{limbs}</body>
@@ -116,6 +153,14 @@ def _model_xml(shapes: Sequence[Shape], arm: bool) -> str:
 </mujoco>"""
 
 
+@dataclass(frozen=True)
+class Wall:
+    """A wall that stands on the table or behind it, parallel to the axes. It belongs to the room and never moves."""
+
+    half: tuple[float, float, float]  #: half edges, metres
+    centre: tuple[float, float, float]  #: metres
+
+
 class PhysicsWorld:
     """Objects on a table, and a finger.
 
@@ -123,14 +168,14 @@ class PhysicsWorld:
     table. `place` puts one object on the table.
     """
 
-    def __init__(self, shapes: Sequence[Shape], arm: bool = True) -> None:
+    def __init__(self, shapes: Sequence[Shape], arm: bool = True, wall: Wall | None = None) -> None:
         import mujoco
 
         if not 1 <= len(shapes) < FINGER_ID:
             raise InputError(f"a world of {len(shapes)} objects, expected 1 .. {FINGER_ID - 1}")
         self.shapes = tuple(shapes)
         self._mj = mujoco
-        self.model = mujoco.MjModel.from_xml_string(_model_xml(shapes, arm))
+        self.model = mujoco.MjModel.from_xml_string(_model_xml(shapes, arm, wall))
         self.data = mujoco.MjData(self.model)
         bodies = np.array([self.model.body(f"o{i}").id for i in range(len(shapes))])
         ids = np.zeros(self.model.nbody, np.int32)
@@ -140,6 +185,23 @@ class PhysicsWorld:
         self.geom_object: np.ndarray = ids[self.model.geom_bodyid]
         #: Index of each geom among the pieces of its body.
         self.geom_piece: np.ndarray = np.arange(self.model.ngeom) - self.model.body_geomadr[self.model.geom_bodyid]
+        #: The shapes with textures of their own, as pairs of object and part, and for each geom the index of its pair
+        #: (-1 for room, finger and arm).
+        self.surfaces: tuple[tuple[int, Part], ...] = tuple(
+            (k, part) for k, s in enumerate(shapes) for part in s.surfaces
+        )
+        self.geom_surface: np.ndarray = np.full(self.model.ngeom, -1)
+        self._meshes = np.zeros(self.model.ngeom, bool)
+        self.has_meshes: bool = any(part.shape.surface is not None for _, part in self.surfaces)
+        first = 0
+        for shape, body in zip(shapes, bodies.tolist(), strict=True):
+            count = len(shape.surfaces)
+            owner = np.repeat(np.arange(count), [len(part.shape.pieces) for part in shape.surfaces])
+            with_mesh = [j for j, part in enumerate(shape.surfaces) if part.shape.surface is not None]
+            start, n = int(self.model.body_geomadr[body]), int(self.model.body_geomnum[body])
+            self.geom_surface[start : start + n] = first + np.concatenate([owner, np.array(with_mesh, int)])
+            self._meshes[start + len(owner) : start + n] = True
+            first += count
         joints = self.model.body_jntadr[bodies]
         #: Indices (n, 7) of position and quaternion (w, x, y, z) of each object in `data.qpos`.
         self.pose_index: np.ndarray = self.model.jnt_qposadr[joints][:, None] + np.arange(7)
@@ -199,12 +261,16 @@ class PhysicsWorld:
         """Advance by n time steps of 2 ms."""
         self._mj.mj_step(self.model, self.data, n)
 
-    def settle(self) -> bool:
-        """Run until no object moves faster than 0.01 m/s or rad/s for 0.1 s. Returns False after 4 s of motion."""
+    def settle(self, only: Sequence[int] | None = None) -> bool:
+        """Run until no object moves faster than 0.01 m/s or rad/s for 0.1 s. Returns False after 4 s of motion.
+
+        `only` has the objects that count, if others are not placed yet.
+        """
+        index = self._velocity_index if only is None else self._velocity_index[list(only)]
         calm = 0
         for _ in range(200):
             self.step(10)
-            calm = calm + 1 if np.abs(self.data.qvel[self._velocity_index]).max() < 0.01 else 0
+            calm = calm + 1 if np.abs(self.data.qvel[index]).max() < 0.01 else 0
             if calm >= 5:
                 break
         self.forward()
@@ -241,14 +307,15 @@ class PhysicsWorld:
         self.forward()
 
     def cast(
-        self, origin: ArrayLike, directions: np.ndarray, groups: Sequence[int] = (0, 1, 2), data: Any = None
+        self, origin: ArrayLike, directions: np.ndarray, groups: Sequence[int] = (0, 1, 2, 4), data: Any = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Cast rays from one point (3,), in metres, along directions (n, 3) of any length.
 
-        `groups` has the numbers of the geom groups that rays can hit: 0 for the room, 1 for objects, 2 for finger and
-        arm. `data` is another state of the same model. The default is the state of the world after `forward`. Returns
-        the first geom (n,) int32 that each ray hits (-1 for none), the distance (n,), and the normal (n, 3) of the
-        surface. The distance is in units of the length of the direction.
+        `groups` has the numbers of the geom groups that rays can hit: 0 for the room, 1 for objects without a mesh, 2
+        for finger and arm, 3 for the convex pieces of objects with a mesh, 4 for meshes. `data` is another state of
+        the same model. The default is the state of the world after `forward`. Returns the first geom (n,) int32 that
+        each ray hits (-1 for none), the distance (n,), and the normal (n, 3) of the surface. The distance is in units
+        of the length of the direction.
         """
         n = len(directions)
         geom, distance = np.full(n, -1, np.int32), np.full(n, -1.0)
@@ -260,6 +327,10 @@ class PhysicsWorld:
             rays = np.ascontiguousarray(directions, dtype=np.float64).reshape(-1)
             flat = normal.reshape(-1)
             self._mj.mj_multiRay(self.model, state, start, rays, visible, True, -1, geom, distance, flat, n, 1e6)
+            if self.has_meshes:  # the faces of a mesh may be turned inside out
+                on = np.flatnonzero((geom >= 0) & self._meshes[geom])
+                turned = on[(directions[on] * normal[on]).sum(axis=1) > 0]
+                normal[turned] *= -1.0
         return geom, distance, normal
 
 

@@ -68,6 +68,7 @@ class SceneEntry(_Entry):
     family: str = ""  #: a simulated family; `set` changes its fields
     seeds: Seeds = ()  #: one scene for each
     set: dict[str, Any] = Field(default_factory=dict)  #: fields of the family
+    objects: str = ""  #: folder of meshes of which the objects of the family are drawn
     recordings: Texts = ()  #: files or folders; a ``*`` stands for any text
     format: str = ""  #: how they are read, as for `mstfilter run`. Default: detected
     options: Texts = ()
@@ -85,8 +86,8 @@ class SceneEntry(_Entry):
             raise ValueError("needs either family and seeds, or recordings")
         if self.family and not self.seeds:
             raise ValueError(f"family {self.family!r} has no seeds")
-        if self.recordings and (self.seeds or self.set):
-            raise ValueError("recordings have neither seeds nor set")
+        if self.recordings and (self.seeds or self.set or self.objects):
+            raise ValueError("recordings have neither seeds, set nor objects")
         return self
 
 

@@ -174,10 +174,12 @@ def _scenes(entry: SceneEntry, folder: Path) -> Iterator[StudyScene]:
     if entry.family:
         from mstfilter.lab.simulation import recipe_key
 
-        family = family_of({"family": entry.family, "set": entry.set})
+        named = {"objects": str((folder / entry.objects).resolve())} if entry.objects else {}
+        source = {"family": entry.family, "set": {**entry.set, **named}}
+        family = family_of(source)
         for seed in entry.seeds:
-            source = {"family": entry.family, "seed": seed, "set": entry.set}
-            yield StudyScene(f"{entry.group_name}-{seed}", entry.group_name, source, recipe_key(family, seed))
+            recipe = {**source, "seed": seed}
+            yield StudyScene(f"{entry.group_name}-{seed}", entry.group_name, recipe, recipe_key(family, seed))
         return
     for pattern in entry.recordings:
         paths = sorted(glob.glob(str(folder / pattern)))

@@ -62,3 +62,25 @@ def test_points_in_workspace_and_view():
         np.array([[0.0, 0.0, 0.05], [0.6, 0.0, 0.05], [0.0, -0.45, 0.05], [0.0, 0.0, -0.5]])
     )
     assert inside.tolist() == [True, False, False, False]
+
+
+def test_fields_that_were_added_do_not_change_the_description_of_earlier_families():
+    described = scene_family("s2").described()
+    assert "voxel_size" in described and "sensor" not in described and "objects" not in described
+    changed = replace(scene_family("s2"), sensor="d435", camera_higher=10.0).described()
+    assert changed == {**described, "sensor": "d435", "camera_higher": 10.0}
+
+
+def test_cameras_differ_in_focal_length_and_height():
+    s1 = scene_family("s1")
+    assert (
+        replace(s1, sensor="azure").camera().K[0, 0]
+        < s1.camera().K[0, 0]
+        < replace(s1, sensor="d435").camera().K[0, 0]
+    )
+    heights = [replace(s1, camera_higher=degrees).camera().position[2] for degrees in (-15.0, 0.0, 30.0)]
+    assert heights[0] < heights[1] < heights[2]
+    for degrees in (-15.0, 30.0):
+        uv, depth = replace(s1, camera_higher=degrees).camera().project(np.array([0.02, 0.05, 0.04]))
+        np.testing.assert_allclose(uv, [319.5, 239.5], atol=1e-6)
+        assert depth == pytest.approx(0.8)

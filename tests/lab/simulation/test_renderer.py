@@ -1,5 +1,7 @@
 """The renderer against closed forms and open3d; the sensors against measurements of real ones."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -9,7 +11,7 @@ from mstfilter.base.lazy import import_open3d
 from mstfilter.lab.simulation.lighting import Stage
 from mstfilter.lab.simulation.recorder import POSE_TOLERANCE
 from mstfilter.lab.simulation.renderer import Renderer
-from mstfilter.lab.simulation.sensor import DepthSensor, colour_reading
+from mstfilter.lab.simulation.sensor import SENSORS, DepthSensor, colour_reading
 from mstfilter.lab.simulation.shapes import Shape, draw_shape
 from mstfilter.lab.simulation.solids import ellipsoid
 from mstfilter.lab.simulation.textures import Atlas, Skin, draw_room, draw_skin, texture_coordinates
@@ -208,6 +210,61 @@ def test_readings_are_missing_to_each_side_of_objects_as_on_real_frames():
     at_border = [np.mean([values[0] for values in found.values()]) for found in (shares, real)]
     assert abs(at_border[0] - at_border[1]) < 0.08
     assert shares[0, -1][1] > shares[0, 1][1] + 0.1
+
+
+@pytest.mark.parametrize(
+    ("name", "at_1_m", "power"), [("d415", 1.5, 2), ("d435", 3.6, 2), ("azure", 1.5, 1), ("l515", 2.5, 1)]
+)
+def test_noise_of_other_cameras_grows_with_the_distance_as_published(name, at_1_m, power):
+    sensor = replace(SENSORS[name], darkest=0.0)
+    for z in (0.7, 1.4):
+        flat = np.full((200, 200), z, np.float32)
+        noisy = sensor.read(np.random.default_rng(0), flat, np.ones_like(flat))
+        assert np.nanmean(noisy) == pytest.approx(z, abs=1e-3)
+        # Rounding of the disparity adds to the noise of stereo cameras.
+        assert 1000 * np.nanstd(noisy) == pytest.approx(at_1_m * z**power, rel=0.15), z
+
+
+def test_noise_of_stereo_is_alike_in_neighbouring_pixels():
+    flat = np.full((200, 640), 1.0, np.float32)
+    alike = []
+    for name in ("xtion", "d435"):
+        noise = SENSORS[name].read(np.random.default_rng(0), flat, np.ones_like(flat)) - 1.0
+        noise = noise[:, 60:]  # the projector's raster ends at the left border
+        alike.append(np.corrcoef(noise[:, 1:].ravel(), noise[:, :-1].ravel())[0, 1])
+    assert abs(alike[0]) < 0.05 and alike[1] > 0.7
+
+
+def test_flying_pixels_lie_between_both_surfaces():
+    depth = np.full((100, 100), 0.8, np.float32)
+    depth[:, 50:] = 1.2
+    sensor = replace(SENSORS["azure"], lateral=0.0, edge_dropout=0.0, flying=1.0, axial=0.0)
+    reading = sensor.read(np.random.default_rng(0), depth, np.ones_like(depth))
+    edge = reading[:, 49:51]
+    assert (edge > 0.8).all() and (edge < 1.2).all() and 0.05 < edge.std() < 0.2
+    assert (reading[:, :48] == np.float32(0.8)).all()
+
+
+def test_dark_and_shiny_surfaces_are_not_read():
+    flat = np.full((60, 60), 1.0, np.float32)
+    ones = np.ones_like(flat)
+    sensor = SENSORS["l515"]
+    dark = np.where(np.arange(60) < 30, 0.02, 0.6).astype(np.float32) * ones
+    lost = np.isnan(sensor.read(np.random.default_rng(0), flat, ones, dark, 0 * ones))
+    assert lost[:, :30].all() and not lost[:, 30:].any()
+    near = np.isnan(sensor.read(np.random.default_rng(0), 0.4 * flat, ones, dark, 0 * ones))
+    assert not near.any()  # enough light comes back from nearby
+    shiny = np.isnan(sensor.read(np.random.default_rng(0), flat, ones, 0.6 * ones, ones))
+    assert shiny.mean() == pytest.approx(sensor.shiny, abs=0.15)
+    assert not DepthSensor().sees_materials and sensor.sees_materials
+
+
+def test_the_renderer_reports_reflectance_and_shine():
+    shape, camera = draw_shape(np.random.default_rng(0), "can"), kinect()
+    view = rendered(shape, (0, 0, shape.half[2]), camera)
+    on = view.instance == 1
+    assert view.reflectance[on].min() > 0 and view.reflectance[on].max() <= 1
+    assert (view.shine[~on] == 0).all() and view.shine[on].max() <= 1
 
 
 def test_the_colour_sensor_keeps_grey_and_order():

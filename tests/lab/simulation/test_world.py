@@ -20,7 +20,7 @@ def arranged(seed, family=DEMO):
     rng = np.random.default_rng(seed)
     objects = draw_objects(rng, family, ANY)
     world = PhysicsWorld(objects.shapes)
-    arrange_objects(rng, world, family, objects.twin_of)
+    arrange_objects(rng, world, family, objects)
     return world, objects, rng
 
 
@@ -119,7 +119,7 @@ def test_objects_that_do_not_fit_on_the_table():
     arrangement._ATTEMPTS = 2
     try:
         with pytest.raises(InputError, match="could not be arranged"):
-            arrange_objects(rng, PhysicsWorld(objects.shapes), crowd, objects.twin_of)
+            arrange_objects(rng, PhysicsWorld(objects.shapes), crowd, objects)
     finally:
         arrangement._ATTEMPTS = kept
 
