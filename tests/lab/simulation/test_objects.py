@@ -243,7 +243,7 @@ def test_own_objects_rest_and_neither_sink_nor_fly(folder, seed):
     assert np.linalg.norm(scene.world.positions() - before, axis=1).max() < 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_scene_of_household_meshes_rests(shared_data, monkeypatch):
     monkeypatch.setenv("MSTFILTER_OBJECTS", str(shared_data("meshes")))
     scene = SimulatedScene(replace(scene_family("m1"), **TINY), 0)
