@@ -216,6 +216,7 @@ def test_the_largest_differences_are_paired_by_seed(tmp_path):
     ]
 
 
+@pytest.mark.nightly
 def test_pictures_of_the_largest_differences(tmp_path):
     """Of runs that were kept: image, truth and hypotheses of both arms; matching objects have the same number."""
     study = make_study(tmp_path / "study", n_scenes=2, groups=("s1",), fail=False)

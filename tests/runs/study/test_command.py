@@ -67,6 +67,7 @@ def test_without_a_terminal_each_finished_run_is_a_line(config, tmp_path, monkey
     assert "slide: pause 1 filtered" in (tmp_path / "studies" / "mine" / "logs" / "worker-0.log").read_text()
 
 
+@pytest.mark.nightly
 def test_messages_go_to_the_log(config, tmp_path, caplog, capsys):
     """Nothing is printed unless a handler is set; `--verbose` sets one."""
     recording = open_recording(tmp_path / "slide")

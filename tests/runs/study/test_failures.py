@@ -79,6 +79,7 @@ def test_a_run_whose_worker_died_is_begun_again(folder, tmp_path):
     assert [p.outcome and p.outcome.tries for p in seen if p.name] == [None, 2]
 
 
+@pytest.mark.nightly
 def test_a_run_that_takes_too_long_is_named(folder, tmp_path, monkeypatch):
     """Only the run that never ends has a time limit, so the test does not depend on the speed of the machine."""
     job_of = studies._job
@@ -137,6 +138,7 @@ def hanging_study(path, recording, marker):
     return path
 
 
+@pytest.mark.nightly
 def test_killing_the_study_and_resuming_ends_with_the_same_table(folder, tmp_path):
     """SIGKILL to the study alone: its workers end too, and the same command resumes it."""
     marker, out = tmp_path / "marker", tmp_path / "out"
@@ -159,6 +161,7 @@ def test_killing_the_study_and_resuming_ends_with_the_same_table(folder, tmp_pat
     assert not list((out / "runs").glob(".*"))
 
 
+@pytest.mark.nightly
 def test_a_script_needs_no_guard(folder, tmp_path):
     """Workers do not import the script."""
     script = tmp_path / "script.py"

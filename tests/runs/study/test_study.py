@@ -140,6 +140,7 @@ def test_arms_that_use_the_ground_truth_are_marked(folder, tmp_path):
         assert marked == result.folder.truth_users.get(run["arm"], [])
 
 
+@pytest.mark.nightly
 def test_what_runs_share_changes_no_result(folder, tmp_path, monkeypatch):
     """Two arms of a recording in one worker, with and without its memory; and the second arm alone."""
     data = {"name": "s", "folder": folder, "scenes": [{"recordings": "slide-0"}], "seeds": [0]}
@@ -328,6 +329,7 @@ def test_a_cluster_that_is_missing_is_one_clear_error(folder, tmp_path, monkeypa
     assert "pip install 'mstfilter[cluster]'" in caught.value.hints
 
 
+@pytest.mark.nightly
 def test_few_recordings_are_divided_between_the_workers(folder, tmp_path):
     """Three workers, two recordings: each of the two parts of a recording has its own worker process."""
     study = load_study(folder / "base.toml", smoke=True)
