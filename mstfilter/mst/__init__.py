@@ -7,10 +7,13 @@ A particle is a `mstfilter.scene.Hypothesis`, a 3-D segmentation of the whole sc
 the next,
 
 1. `tracking` moves the objects of each hypothesis as the video shows (section IV-C; the `Transition`);
-2. `segmentation` samples segmentations of the latest image, as cuts of a segmentation tree, and asks `completion` for
-   the voxels of each segment (IV-B; the `Proposal`);
-3. `partition` weighs the ways in which moved and sampled hypotheses can be combined, and has the objects completed
-   (IV-D; the `Update`). The published update, which crosses pairs of hypotheses, is `crossover`.
+2. `segmentation` samples segmentations of the latest image, as cuts of a segmentation tree (IV-B; the `Proposal`);
+3. `partition` weighs the ways in which moved and sampled hypotheses can be combined (IV-D; the `Update`). The
+published
+   update, which crosses pairs of hypotheses, is `crossover`.
+
+Both the proposal and the update have a field `completer`, from `completion`, which turns segments into voxels. `mst`
+completes in its update, once per object and from all its views; the published filter completes each sample.
 
 A resampler of `mstfilter.smc` then keeps a few. `belief` answers questions from the weighted hypotheses. `frontends`
 puts masks, shapes and trackers of other programs in the place of ours. `testing` has the contracts that a component

@@ -12,9 +12,10 @@ several filter seeds on one scene are averaged first.
 
 A claim rests on the p value of a sign-flip test of the mean difference (`scipy.stats.permutation_test`), which Holm's
 method adjusts for all comparisons of a table. The bootstrap interval beside each difference (BCa,
-`scipy.stats.bootstrap`) describes the difference and decides nothing. The test assumes only that a difference is as
-likely to be positive as negative if the methods are equally good. Differences of squared errors are often skewed
-instead, so look at them before you trust a small p value: `experiments/comparison` has the error rates.
+`scipy.stats.bootstrap`) describes the difference and decides nothing. The test assumes that, if the methods are
+equally good, differences are symmetric about zero: a difference d is as likely as -d. Differences of squared errors
+are often skewed instead, so look at them before you trust a small p value: `experiments/comparison` has the error
+rates.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ import numpy as np
 
 from mstfilter.base.errors import InputError
 
-LEVEL = 0.95
+LEVEL = 0.95  # of intervals
+SIGNIFICANT = 0.05  # a claim needs a smaller adjusted p value
 CLAIM = 20  # fewest units for a claim
 N_FLIPS = 9999  # random sign flips; up to 13 units have fewer flips, and all of them are enumerated
 N_BOOTSTRAP = 4999
@@ -66,7 +68,7 @@ class Difference:
     @property
     def is_claim(self) -> bool:
         """Whether the adjusted p value is below .05 and there are at least 20 units."""
-        return self.p_holm < 1 - LEVEL and self.n >= CLAIM
+        return self.p_holm < SIGNIFICANT and self.n >= CLAIM
 
 
 #: Unit -> value, or one value per unit in the order that all arms share.
@@ -80,7 +82,8 @@ def compare(first: Values, second: Values) -> Difference:
     ----------
     first, second : mapping, or (n,) array_like
         A mapping from units to values, or arrays of values with the same order of units. Units without a finite
-        value, such as the seeds of runs in which all weights became zero, are omitted.
+        value, such as the seeds of runs in which all weights became zero, are omitted. This favours a method that
+        fails in difficult cases, so report how many are missing (`n` is what is left).
 
     Raises
     ------
@@ -121,7 +124,10 @@ def _interval(values: tuple[float, ...]) -> tuple[float, float]:
 
 
 def sign_flip(values: np.ndarray) -> float:
-    """Two-sided p value of the sign-flip test of a zero mean: exact up to 13 values, else with random flips."""
+    """Two-sided p value of the test that values are symmetric about zero, by flips of their signs.
+
+    All flips are enumerated for up to 13 values; for more, they are random.
+    """
     return _sign_flip(tuple(np.asarray(values, dtype=np.float64).tolist()))
 
 
@@ -179,7 +185,7 @@ def conclusion(difference: Difference, first: str, second: str, where: str = "",
     if d.n == 1:
         return f"{first} and {second}{at}: no difference can be claimed at n = 1."
     found = f"{d.mean:+#.3g}, 95 % interval {d.low:+#.3g} to {d.high:+#.3g}, p {d.p_holm:.2g} after Holm, n = {d.n}"
-    if not d.p_holm < 1 - LEVEL:
+    if not d.p_holm < SIGNIFICANT:
         return f"{first} and {second}{at}: no difference can be claimed at n = {d.n} ({found})."
     if not d.is_claim:
         return f"{first} minus {second}{at}: {found}. A first look: claims need {CLAIM} {unit}s."

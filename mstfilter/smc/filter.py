@@ -1,9 +1,10 @@
 """The particle filter: a short loop over components.
 
-A filter keeps a weighted set of particles x_t^1 .. x_t^n which stands for what is known after the observations
-y_0 .. y_t: the weighted mean of any function of the particles estimates its posterior expectation. A new observation
-y needs three things: particles are selected in proportion to their weights, moved by the model, and weighted by how
-well they explain y. Each is a component, and a step calls one after the other::
+A filter keeps a weighted set of particles x_t^1 .. x_t^n which stands for what is known after the observations y_0 ..
+y_t: if all components are properly weighted, the weighted mean of any function of the particles estimates its
+posterior expectation. A new observation y needs three things: particles are selected in proportion to their weights,
+moved by the model, and weighted by how well they explain y. Each is a component, and a step calls one after the other
+(it resamples if the `trigger` says so)::
 
     past      = resampler.resample(previous, n)          only with resample="before", the textbook order
     predicted = transition.predict(past, y)
@@ -11,8 +12,9 @@ well they explain y. Each is a component, and a step calls one after the other::
     fused     = update.update(predicted, proposed, y)
     next      = resampler.resample(fused, n)             with resample="after", the order of MST
 
-Textbook filters have no `proposal`. The bootstrap filter of x_0 ~ N(0, 1), x_t ~ N(0.9 x_{t-1}, 0.5^2) and y_t ~
-N(x_t, 1) moves by the model and weights by the likelihood:
+A `Proposal` makes particles from the observation alone, without the past. Textbook filters have none in a step: what
+textbooks call the proposal density is a guided `Transition` here. The bootstrap filter of x_0 ~ N(0, 1), x_t ~ N(0.9
+x_{t-1}, 0.5^2) and y_t ~ N(x_t, 1) moves by the model and weights by the likelihood:
 
 >>> from mstfilter.smc import Dynamics, Normal, ParticleFilter, Prior, Reweight, StateSpaceModel
 >>> model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 1.0))
@@ -23,7 +25,7 @@ N(x_t, 1) moves by the model and weights by the likelihood:
 
 `bootstrap(model, n=1000)` is the same filter. Guided filters have a transition that also weights particles, and MST
 (Price, Huang, Berenson 2021) uses all four components above. With ``resample="before"``, a step also resamples after
-an update that returned more than n particles.
+an update that returned more than n particles, unless the resampler chooses the number itself (`Sized`).
 
 `step` is a pure function of a `State`, so a run can be stopped, stored and resumed at any step. Reference: Chopin and
 Papaspiliopoulos (2020), "An introduction to sequential Monte Carlo", chapter 10.
@@ -87,7 +89,8 @@ class ParticleFilter(AtStep):
     resampler : Resampler
         Selects particles by weight.
     trigger : Trigger
-        Decides whether a step resamples. A population of more than `n` particles is always resampled.
+        Decides whether a step resamples. A population of more than `n` particles is resampled anyway,
+        unless the resampler chooses their number (`Sized`).
     lookahead : Lookahead, optional
         Auxiliary filter: particles are selected by weight times priority. Requires ``resample="before"``.
     rejuvenation : Rejuvenation, optional

@@ -50,7 +50,7 @@ class Component(AtStep, ABC):
 
     @property
     def properly_weighted(self) -> bool:
-        """Whether unnormalised weighted sums over the result are unbiased, as in an exact particle filter.
+        """Whether unnormalised weighted means over the result are unbiased, as in an exact particle filter.
 
         The author of a component declares whether this holds. `mstfilter check` tests it for resamplers. A filter
         reports the log evidence only if it has no `proposal` and all its components are properly weighted.
@@ -130,6 +130,13 @@ class Resampler(Component):
     """Selects particles by weight. A scheme that compares particles inherits `Resampler` and defines `resample`.
 
     A scheme that needs only the weights inherits `WeightResampler` and defines `select`.
+
+    Every scheme promises the following, and `mstfilter.smc.testing.ResamplerContract` tests it:
+
+    - The particles are those at the ancestors, with their other parents. A particle of weight 0 is never selected.
+    - There are n of them, unless `exact_size` or `chooses_n` say otherwise.
+    - If it is `properly_weighted`, the copies of particle i carry in expectation the weight W_i that it had; with
+      equal output weights, these are n W_i copies.
     """
 
     @property

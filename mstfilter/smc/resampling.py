@@ -14,6 +14,9 @@ Ssp             floor or ceil, fractions decided pair by pair      f (1 - f)
 Killing         survive with w_i / max w, else multinomial         see `Killing`
 ==============  =================================================  ====================================
 
+What matters for an estimate is also how the copies of different particles vary together. So for particles in an
+unlucky order `Systematic` can be worse than `Multinomial`, though not for sorted ones (`Sorted`).
+
 >>> import numpy as np
 >>> rng = np.random.default_rng(0)
 >>> Systematic().select(rng, np.log([0.5, 0.25, 0.25]), 4)[0]
@@ -23,8 +26,8 @@ Weights need not sum to 1, may have any float type, and may be zero (log weight 
 weights. A particle of weight zero is never selected. The `select` method of your own `WeightResampler` can use
 `inverse_cdf`, `independent_draws` and `draw_rows`.
 
-Of several particles with equal weights, `LargestWeights` and `leader_clusters` take the first. Random schemes do not
-compare weights.
+Of several particles with equal weights, `LargestWeights` and `leader_clusters` take the first; for the random schemes
+ties play no role.
 
 References: Douc, Cappe, Moulines (2005), "Comparison of resampling schemes for particle filtering"; Kitagawa (1996);
 Liu and Chen (1998).
@@ -105,8 +108,8 @@ class Ssp(WeightResampler):
     The fractions frac(n W_i) form pairs (a, b), with up = min(1 - a, b) and down = min(a, 1 - b). With probability
     down / (up + down), a increases and b decreases by `up`. Otherwise, a decreases and b increases by `down`. One of
     the fractions is then 0 or 1 and final; the other fraction is paired again. All pairs of a round are processed
-    together, so m particles need log2(m) rounds instead of m steps (Gerber, Chopin, Whiteley 2019, "Negative
-    association, ordering and convergence of resampling methods").
+    together, so m particles need log2(m) rounds, where the published loop takes m steps (Gerber, Chopin,
+    Whiteley 2019, "Negative association, ordering and convergence of resampling methods").
     """
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:

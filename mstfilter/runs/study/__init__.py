@@ -8,6 +8,14 @@
 `run_study` plans the runs, which are every arm (configuration of the filter) on every scene with every seed. Worker
 processes make those that are missing, all runs of one recording in one worker, each as a `mstfilter.runs.RunFolder`.
 Then the tables of the study folder are written from them.
+
+=========  =======================================================================================
+`config`   a study as written in its file: scenes, arms, seeds, metrics
+`plan`     the runs that it asks for, and what makes a run the same as an earlier one
+`study`    the loop over recordings; `worker` makes the runs of one recording in a process
+`results`  the study's folder: what its runs measured, row by row
+`summary`  arms paired scene by scene (`summarise`), differences and what may be claimed
+=========  =======================================================================================
 """
 
 from mstfilter.base.lazy import attach
