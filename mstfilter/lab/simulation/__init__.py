@@ -18,10 +18,10 @@ Objects are generated, or they are meshes of your own:
 
 >>> simulate_recording(replace(scene_family("s1"), objects="my_objects"), 7, "recordings/mine-7")  # doctest: +SKIP
 
-From bottom to top, the modules are `solids`, `surfaces` and `shapes` (objects), `objects` (folders of meshes),
-`sensor` (noise), `families` (parameters of scenes), `world` (MuJoCo physics, pushes), `printing` and `textures`
-(appearance), `groups` (objects that stand together), `arrangement` (placement), `lighting` and `renderer` (ray
-casting), `recorder` (recordings and their cache) and `push_loop`.
+From bottom to top, the modules are `solids`, `volumes`, `surfaces` and `shapes` (objects), `objects` (folders of
+meshes), `sensor` (noise), `families` (parameters of scenes), `world` (MuJoCo physics, pushes), `printing` and
+`textures` (appearance), `groups` (objects that stand together), `arrangement` (placement), `lighting` and `renderer`
+(ray casting), `recorder` (recordings and their cache) and `push_loop`.
 
 Depth noise, the shadow of the projector and missing readings at edges of the default sensor are calibrated to real
 frames; the other sensors follow published figures. What real scenes have and these do not: a moving camera,

@@ -22,11 +22,9 @@ others (or, if the group is one, the whole), "together" moves all parts as one b
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 
@@ -36,7 +34,7 @@ from mstfilter.lab.simulation.objects import MeshPool, ObjectSet
 from mstfilter.lab.simulation.shapes import Part, Pool, Shape, draw_shape
 from mstfilter.lab.simulation.solids import box
 from mstfilter.lab.simulation.textures import Skin, draw_skin, sliced
-from mstfilter.lab.simulation.world import FingerPush, PhysicsWorld, draw_push, is_clear, play_push
+from mstfilter.lab.simulation.world import FingerPush, PhysicsWorld, draw_push, tried_pushes
 from mstfilter.scene import Recording
 
 _OFFSET, _TURN, _GAP = 0.01, np.deg2rad(5.0), 0.002  # largest errors of setting down by hand
@@ -307,10 +305,9 @@ def part_image(recording: Recording, frame: int) -> np.ndarray:
     without a depth reading, are 0. With this image, the probability that two parts are one object can be asked of a
     filter, whether they are or not.
     """
-    instance, image = recording.instance(frame), recording.frames[frame]
-    if recording.path is None or instance is None:
-        raise InputError(f"recording {recording.name} has no folder with poses and instances", "simulate it")
-    poses = json.loads((Path(recording.path) / "poses.json").read_text(encoding="utf-8"))[frame]["T_world_object"]
+    instance, image, poses = recording.instance(frame), recording.frames[frame], recording.poses(frame)
+    if instance is None or poses is None:
+        raise InputError(f"recording {recording.name} has no true poses and instances", "simulate it")
     points = image.camera.unproject(image.depth)
     found = np.zeros(instance.shape, np.uint16)
     number = 0
@@ -318,7 +315,7 @@ def part_image(recording: Recording, frame: int) -> np.ndarray:
         best = np.full(instance.shape, np.inf)
         for part in group["parts"]:
             number += 1
-            pose = np.array(poses[str(part["object"])])
+            pose = poses[part["object"]]
             turn = pose[:3, :3] @ np.array(part["rotation"])
             at = pose[:3, :3] @ part["position_m"] + pose[:3, 3]
             with np.errstate(invalid="ignore"):
@@ -337,17 +334,9 @@ def choose_group_push(
 
     If no candidate has the aim, a push is taken that moves some object. Raises InputError if there is none.
     """
-    saved, before = world.save(), world.poses()
+    before = world.poses()
     fallback: FingerPush | None = None
-    for _ in range(4 * family.n_candidates):
-        push = _draw_group_push(rng, world, family, groups, aim)
-        if not is_clear(world, push.start):
-            continue
-        result = play_push(world, push, family)
-        after = world.poses()
-        world.restore(saved)
-        if not (result.kept and result.settled):
-            continue
+    for push, result, after in tried_pushes(world, family, lambda: _draw_group_push(rng, world, family, groups, aim)):
         if any(_has_aim(group, before, after, aim) for group in groups) and (
             aim != "nothing" or all(_has_aim(group, before, after, aim) for group in groups)
         ):

@@ -19,19 +19,19 @@ which other objects a folder has.
 
 from __future__ import annotations
 
-import csv
 import functools
 import hashlib
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from mstfilter.base.errors import InputError, missing_library
-from mstfilter.base.files import reading
+from mstfilter.base.files import read_csv, reading
+from mstfilter.base.reading import read_arrays
 from mstfilter.lab.simulation.shapes import Shape
 from mstfilter.lab.simulation.surfaces import MeshSurface, Triangles, cache_folder, centred, prepared_mesh
 
@@ -219,8 +219,8 @@ def _open(path: Path, scale: float, up: str, state: tuple[tuple[str, int, int], 
 def _read_index(path: Path) -> dict[str, dict[str, str]]:
     if not path.is_file():
         return {}
-    with reading(path, "a table of objects"), open(path, encoding="utf-8", newline="") as file:
-        return {row["id"]: row for row in csv.DictReader(file) if row.get("id")}
+    with reading(path, "a table of objects"):
+        return {row["id"]: row for row in read_csv(path) if row.get("id")}
 
 
 def _described(one: MeshObject, row: Mapping[str, str]) -> dict[str, Any]:
@@ -229,8 +229,6 @@ def _described(one: MeshObject, row: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _of_file(path: Path, index: Mapping[str, Mapping[str, str]], scale: float, up: str) -> MeshObject:
-    from dataclasses import replace
-
     try:
         triangles = _read_mesh(path)
     except InputError:
@@ -289,10 +287,7 @@ def _read_archives(path: Path, index: Mapping[str, Mapping[str, str]], scale: fl
     Arrays of an archive: ``id`` (n,), ``v`` (V, 3) metres, ``f`` (F, 3), ``v_start`` and ``f_start`` (n + 1,), and,
     if there are colours, ``colour`` (F, 3) uint8 and ``has_colour`` (n,).
     """
-    from dataclasses import replace
-
-    with reading(path, "an archive of meshes"), np.load(path, allow_pickle=False) as file:
-        z = dict(file)
+    z = read_arrays(path, "an archive of meshes")
     missing = [name for name in ("id", "v", "f", "v_start", "f_start") if name not in z]
     if missing:
         raise InputError(f"archive of meshes {path} has no array {missing[0]!r}")

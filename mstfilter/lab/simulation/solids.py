@@ -109,6 +109,12 @@ def cylinder(radius: float, half_height: float, at: ArrayLike = (0, 0, 0)) -> Pi
     return _upright("cylinder", (radius, half_height), at)
 
 
+def perpendicular(z: np.ndarray) -> np.ndarray:
+    """A unit vector (3,) at a right angle to a unit vector (3,)."""
+    x = np.cross(z, np.eye(3)[int(np.argmin(np.abs(z)))])
+    return np.asarray(x / np.linalg.norm(x))
+
+
 def ellipsoid(half: tuple[float, float, float]) -> Piece:
     """An ellipsoid from its half axes."""
     return _upright("ellipsoid", half, (0, 0, 0))
@@ -120,8 +126,7 @@ def capsule(start: ArrayLike, end: ArrayLike, radius: float, plain: bool = False
     axis = end - start
     length = float(np.linalg.norm(axis))
     z = axis / length
-    x = np.cross(z, np.eye(3)[int(np.argmin(np.abs(z)))])
-    x /= np.linalg.norm(x)
+    x = perpendicular(z)
     rotation = np.stack([x, np.cross(z, x), z], axis=1)
     return Piece("capsule", (float(radius), float(length / 2)), (start + end) / 2, rotation, None, plain)
 

@@ -20,7 +20,7 @@ topples nor drops an object.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -448,6 +448,25 @@ def draw_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily
     return FingerPush((float(start[0]), float(start[1])), (float(end[0]), float(end[1])), family.action_seconds)
 
 
+def tried_pushes(
+    world: PhysicsWorld, family: SceneFamily, draw: Callable[[], FingerPush]
+) -> Iterator[tuple[FingerPush, PushEffect, np.ndarray]]:
+    """Simulate up to 4 `family.n_candidates` drawn pushes: pushes, their effects, and the poses (n, 4, 4) afterwards.
+
+    Pushes that begin inside an object, drop an object or leave one in motion are left out. The world does not change.
+    """
+    saved = world.save()
+    for _ in range(4 * family.n_candidates):
+        push = draw()
+        if not is_clear(world, push.start):
+            continue
+        effect = play_push(world, push, family)
+        after = world.poses()
+        world.restore(saved)
+        if effect.kept and effect.settled:
+            yield push, effect, after
+
+
 def choose_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily) -> FingerPush:
     """Simulate candidate pushes and choose a push that moves objects. The world does not change.
 
@@ -456,16 +475,8 @@ def choose_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFami
     toppled objects is taken. Candidates that drop an object or leave an object in motion are discarded. Raises
     InputError if no candidate moves any object.
     """
-    saved = world.save()
     best: tuple[float, FingerPush] | None = None
-    for _ in range(4 * family.n_candidates):
-        push = draw_push(rng, world, family)
-        if not is_clear(world, push.start):
-            continue
-        result = play_push(world, push, family)
-        world.restore(saved)
-        if not (result.kept and result.settled):
-            continue
+    for push, result, _ in tried_pushes(world, family, lambda: draw_push(rng, world, family)):
         count = result.moved(family.move_threshold)
         toppled = int((result.turned > np.deg2rad(75)).sum())
         if count == 0:

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 from mstfilter.base.errors import InputError
 from mstfilter.lab.simulation import surfaces
 from mstfilter.lab.simulation.shapes import SHAPE_FAMILIES, Part, Shape, _thin_walls, draw_shape, label_voxels
-from mstfilter.lab.simulation.surfaces import MeshSurface, prepare_mesh, prepared_mesh, volume_fractions
+from mstfilter.lab.simulation.surfaces import MeshSurface, prepare_mesh, prepared_mesh
+from mstfilter.lab.simulation.volumes import volume_fractions
 from mstfilter.scene import VoxelGrid
 from tests.lab.simulation.meshes import box_mesh, cup_mesh, lathe_mesh, triangles
 
