@@ -9,8 +9,7 @@ the next,
 1. `tracking` moves the objects of each hypothesis as the video shows (section IV-C; the `Transition`);
 2. `segmentation` samples segmentations of the latest image, as cuts of a segmentation tree (IV-B; the `Proposal`);
 3. `partition` weighs the ways in which moved and sampled hypotheses can be combined (IV-D; the `Update`). The
-published
-   update, which crosses pairs of hypotheses, is `crossover`.
+   published update, which crosses pairs of hypotheses, is `crossover`.
 
 Both the proposal and the update have a field `completer`, from `completion`, which turns segments into voxels. `mst`
 completes in its update, once per object and from all its views; the published filter completes each sample.
