@@ -40,6 +40,7 @@ from mstfilter.smc.inference.parameters import (
     particle_gibbs as particle_gibbs,
     pmmh as pmmh,
 )
+from mstfilter.smc.inference.samplers import Sampled as Sampled, ibis as ibis, tempering as tempering
 from mstfilter.smc.inference.smoothing import (
     Record as Record,
     backward_paths as backward_paths,

@@ -335,14 +335,14 @@ class _Step:
             with self.slot("initial"):
                 return self.call("initial", "sample", self.y, self.filter.n, n=self.filter.n)
         stayed = {"previous": identity(len(past))}
-        population = past.realised().labelled(stayed)
+        population = past.realised()
         if self.filter.transition is None:
-            return population
+            return population.labelled(stayed)
+        fresh = {name: past.parents[name] for name in ("ancestor",) if name in past.parents}
         with self.slot("transition"):
-            moved = self.call("transition", "predict", population, self.y)
-        if "previous" in moved.parents or len(moved) != len(population):
-            return moved
-        return moved.labelled({**moved.parents, **stayed}, moved.notes)
+            moved = self.call("transition", "predict", population.labelled(fresh | stayed), self.y)
+        parents = moved.parents if len(moved) != len(population) else stayed | moved.parents
+        return moved.labelled({k: v for k, v in parents.items() if k != "ancestor"}, moved.notes)
 
     def propose(self) -> Population | None:
         """Particles drawn from the observation; None if the observation is missing."""
