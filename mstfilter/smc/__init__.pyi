@@ -41,6 +41,7 @@ from mstfilter.smc.inference.parameters import (
     pmmh as pmmh,
 )
 from mstfilter.smc.inference.samplers import Sampled as Sampled, ibis as ibis, tempering as tempering
+from mstfilter.smc.inference.smc2 import smc2 as smc2
 from mstfilter.smc.inference.smoothing import (
     Record as Record,
     backward_paths as backward_paths,

@@ -74,6 +74,9 @@ class Sampled:
     powers: np.ndarray  #: (T,) power of the likelihood after each step, 1 if it is not tempered
     accepted: np.ndarray  #: (T,) share of accepted proposals of the moves in each step; NaN without moves
     run: RunVariance  #: the estimates after each step, and the last state
+    states: Population | None = None  #: of `smc2`: the last states of all filters, weighted
+    state_mean: np.ndarray | None = None  #: (T, k) of `smc2`: means of the function of the states
+    state_mean_error: np.ndarray | None = None  #: (T, k) their standard errors over seeds
 
     def __repr__(self) -> str:
         moved = np.isfinite(self.accepted)
@@ -183,8 +186,8 @@ class Target(ABC):
     """
 
     @abstractmethod
-    def evaluate(self, rng: np.random.Generator, theta: Any, n: int, data: Any) -> Rows:
-        """`LOG_LIKELIHOOD` (n,) and further variables of n particles with these parameters."""
+    def evaluate(self, rng: np.random.Generator, theta: Any, n: int, data: Any, like: Rows) -> Rows:
+        """`LOG_LIKELIHOOD` (n,), and further variables as those of the particles `like`, of n particles."""
 
     @abstractmethod
     def extend(
@@ -213,12 +216,12 @@ class _Tempered(Target):
     share: float
 
     def first(self, theta: Any, n: int) -> Rows:
-        return {**self.evaluate(_UNUSED, theta, n, None), _POWER: np.zeros(n)}
+        return {**self.evaluate(_UNUSED, theta, n, None, {}), _POWER: np.zeros(n)}
 
     def before(self, data: Any) -> Any:
         return None
 
-    def evaluate(self, rng: np.random.Generator, theta: Any, n: int, data: Any) -> Rows:
+    def evaluate(self, rng: np.random.Generator, theta: Any, n: int, data: Any, like: Rows) -> Rows:
         return {LOG_LIKELIHOOD: checked_densities("log likelihood", self.log_likelihood(theta), n)}
 
     def extend(
@@ -247,7 +250,7 @@ class _Sequential(Target):
 
     log_likelihood: Callable[..., np.ndarray]
 
-    def evaluate(self, rng: np.random.Generator, theta: Any, n: int, data: Any) -> Rows:
+    def evaluate(self, rng: np.random.Generator, theta: Any, n: int, data: Any, like: Rows) -> Rows:
         return {LOG_LIKELIHOOD: sum((self._of_step(theta, n, t, y) for t, y in enumerate(data)), np.zeros(n))}
 
     def extend(
@@ -300,9 +303,17 @@ class Sampler:
             )
 
     def sample(
-        self, data: Iterable[Any], seed: int, lag: int | None, until: Callable[[State], bool] | None = None
+        self,
+        data: Iterable[Any],
+        seed: int,
+        lag: int | None,
+        until: Callable[[State], bool] | None = None,
+        extra: Callable[[Mapping[str, np.ndarray]], np.ndarray] | None = None,
     ) -> Sampled:
-        """Run the sampler over the data, or until a state fulfils a condition."""
+        """Run the sampler over the data, or until a state fulfils a condition.
+
+        ``extra(particles)`` (n, k) are further values to average at every step.
+        """
         theta = _Parameters(as_distribution(self.prior))
         resampler = Sized(self.resampler, _Part(self.steps + 1)) if self.waste_free else self.resampler
         filter = ParticleFilter(
@@ -313,7 +324,12 @@ class Sampler:
             trigger=self.trigger,
             n=self.n,
         )
-        run = run_variance(filter, data, seed, lag, theta.matrix, until=until)
+
+        def averaged(rows: Mapping[str, np.ndarray]) -> np.ndarray:
+            return np.hstack([theta.matrix(rows), *([] if extra is None else [extra(rows)])])
+
+        run = run_variance(filter, data, seed, lag, averaged, until)
+        mean, error = run.mean, np.sqrt(run.mean_variance)
         population, variance = run.state.population, run.log_evidence_variance[-1:]
         if population is None:
             raise InputError("there are no observations")
@@ -322,11 +338,13 @@ class Sampler:
             population.moved(theta.given(population.particles)),
             float(run.log_evidence[-1]),
             float(np.sqrt(variance[0])) if variance[0] >= 0 else np.nan,
-            theta.by_name(run.mean[-1]),
-            theta.by_name(np.sqrt(run.mean_variance[-1])),
+            theta.by_name(mean[-1, : theta.d]),
+            theta.by_name(error[-1, : theta.d]),
             np.array([found["update"]["power"] for found in notes]),
             np.array([found.get("transition", {}).get("accepted", np.nan) for found in notes]),
             run,
+            state_mean=None if extra is None else mean[:, theta.d :],
+            state_mean_error=None if extra is None else error[:, theta.d :],
         )
 
 
@@ -456,7 +474,7 @@ class _Moves(Transition):
             inside = np.flatnonzero(log_prior > -np.inf)  # the likelihood may not be defined elsewhere
             if len(inside):
                 some = theta if len(inside) == len(columns) else take(theta, inside)
-                found = self.target.evaluate(rng, some, len(inside), data)
+                found = self.target.evaluate(rng, some, len(inside), data, now)
                 new |= {name: _placed(now[name], inside, a) for name, a in found.items()}
             gain = power * (new[LOG_LIKELIHOOD] - now[LOG_LIKELIHOOD])
             return new, np.where(log_prior > -np.inf, log_prior - now[_PRIOR] + gain, -np.inf)
