@@ -27,6 +27,7 @@ from mstfilter.smc.history import (
     resampled as resampled,
     unique_ancestors as unique_ancestors,
 )
+from mstfilter.smc.inference.additive import additive as additive
 from mstfilter.smc.inference.conditional import conditional_path as conditional_path, path_log_prob as path_log_prob
 from mstfilter.smc.inference.diagnostics import (
     RunVariance as RunVariance,
@@ -49,6 +50,7 @@ from mstfilter.smc.inference.smoothing import (
     genealogy as genealogy,
     keep as keep,
 )
+from mstfilter.smc.inference.two_filter import two_filter as two_filter
 from mstfilter.smc.inputs import WithInput as WithInput
 from mstfilter.smc.interfaces import (
     Codec as Codec,
