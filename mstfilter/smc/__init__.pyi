@@ -98,6 +98,7 @@ from mstfilter.smc.models.gaussian import (
 )
 from mstfilter.smc.models.programs.filters import Program as Program
 from mstfilter.smc.models.programs.sites import observe as observe, sample as sample, switch as switch
+from mstfilter.smc.models.quasi import SobolGenerator as SobolGenerator, sqmc as sqmc
 from mstfilter.smc.models.state_space import (
     Dynamics as Dynamics,
     Prior as Prior,

@@ -181,8 +181,9 @@ def _given_to_program(component: Any, old: Particles | None, given: Particles, y
     if component.guide is None or y is None:
         particle, gain = run_program(component.model, GivenHandler(given, weigh=False), old, y, 1)
         return particle, gain[0]
-    _, log_q = run_program(component.guide, GivenHandler(given), old, y, 1)
-    particle, log_p = run_program(component.model, GivenHandler(given), old, y, 1)
+    guide = GivenHandler(given)
+    _, log_q = run_program(component.guide, guide, old, y, 1)
+    particle, log_p = run_program(component.model, GivenHandler(given, weigh=guide.reached), old, y, 1)
     return particle, log_p[0] - log_q[0]
 
 
