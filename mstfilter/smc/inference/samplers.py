@@ -58,7 +58,7 @@ Rows = dict[str, np.ndarray]
 
 #: Variables of particles beside the parameters, whose names may not be the same.
 LOG_LIKELIHOOD = "log likelihood"
-_RESERVED = _PRIOR, _POWER, _ROOT = "log prior", "power of the likelihood", "root of the covariance of a step"
+_PRIOR, _POWER, _ROOT = "log prior", "power of the likelihood", "root of the covariance of a step"
 _ONE, _UNUSED = np.ones(1), np.random.default_rng(0)
 
 
@@ -315,11 +315,12 @@ class Sampler:
         ``extra(particles)`` (n, k) are further values to average at every step.
         """
         theta = _Parameters(as_distribution(self.prior))
+        d = theta.d
         resampler = Sized(self.resampler, _Part(self.steps + 1)) if self.waste_free else self.resampler
         filter = ParticleFilter(
             initial=_FromPrior(theta, self.target),
             transition=_Moves(theta, self.target, self.steps, self.waste_free),
-            update=_Extend(theta, self.target, None if self.scale is None else step_root(self.scale, theta.d)),
+            update=_Extend(theta, self.target, None if self.scale is None else step_root(self.scale, d)),
             resampler=resampler,
             trigger=self.trigger,
             n=self.n,
@@ -338,13 +339,13 @@ class Sampler:
             population.moved(theta.given(population.particles)),
             float(run.log_evidence[-1]),
             float(np.sqrt(variance[0])) if variance[0] >= 0 else np.nan,
-            theta.by_name(mean[-1, : theta.d]),
-            theta.by_name(error[-1, : theta.d]),
+            theta.by_name(mean[-1, :d]),
+            theta.by_name(error[-1, :d]),
             np.array([found["update"]["power"] for found in notes]),
             np.array([found.get("transition", {}).get("accepted", np.nan) for found in notes]),
             run,
-            state_mean=None if extra is None else mean[:, theta.d :],
-            state_mean_error=None if extra is None else error[:, theta.d :],
+            state_mean=None if extra is None else mean[:, d:],
+            state_mean_error=None if extra is None else error[:, d:],
         )
 
 
@@ -369,9 +370,11 @@ class _Parameters:
         """One draw, which shows names, shapes and types."""
         drawn = self.prior.sample(np.random.default_rng(0), 1)
         for name, a in drawn.items() if isinstance(drawn, Mapping) else [("theta", drawn)]:
-            if name in _RESERVED or a.dtype.kind != "f":
+            if name in (LOG_LIKELIHOOD, _PRIOR, _POWER, _ROOT):
+                raise InputError(f"a parameter cannot have the name {name!r}, which the sampler uses", "rename it")
+            if a.dtype.kind != "f":
                 raise InputError(
-                    f"parameter {name!r} is of type {a.dtype}, expected floats under a name other than {_RESERVED}",
+                    f"parameter {name!r} is of type {a.dtype}, expected floats",
                     "a random walk moves continuous parameters: sum over discrete ones in the likelihood",
                 )
         return drawn
