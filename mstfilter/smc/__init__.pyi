@@ -75,6 +75,7 @@ from mstfilter.smc.interfaces import (
 from mstfilter.smc.models.distributions import (
     Bernoulli as Bernoulli,
     Categorical as Categorical,
+    Joint as Joint,
     MultivariateNormal as MultivariateNormal,
     Normal as Normal,
     Student as Student,

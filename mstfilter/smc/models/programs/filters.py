@@ -112,7 +112,7 @@ def program_step(
     if guide is None:
         return run_program(model, SampleHandler(rng), previous, observation, n)
     proposed = GuideHandler(rng, n)
-    run_program(guide, proposed, previous, observation, n)
+    run_once(guide, proposed, previous, observation, n)
     return run_program(model, ReplayHandler(proposed, rng), previous, observation, n)
 
 
