@@ -5,6 +5,7 @@
 `distributions`  what models are made of; any distribution of scipy.stats fits in, too
 `exact`          linear-Gaussian and finite models, whose posterior is known
 `gaussian`       models with Gaussian noise: UKF proposals, Rao-Blackwellised filters
+`quasi`          Sobol points in place of random numbers (SQMC)
 
 All public names are imported from `mstfilter.smc`.
 """
