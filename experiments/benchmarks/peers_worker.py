@@ -1,9 +1,9 @@
 """Measure `particles` 0.4 in a separate environment; run by speed.py, one command per line on standard input.
 
 Commands: ``filter SEED N`` (bootstrap AR(1)), ``backward:METHOD SEED N`` (N paths of a filter of N particles by the
-method ``backward_sampling_METHOD``), ``online:CLASS SEED N`` (a collector of smoothed sums), ``sampler:NAME SEED N`` (an
-SMC sampler of `samplers.py`), ``SCHEME SEED N`` (resampling N even normalised weights), and ``log:SCHEME SEED N`` (the
-same from log weights). The answer is one line of JSON. First calls include compilation.
+method ``backward_sampling_METHOD``), ``online:CLASS SEED N`` (a collector of smoothed sums), ``sampler:NAME SEED N``
+(an SMC sampler of `samplers.py`), ``SCHEME SEED N`` (resampling N even normalised weights), and ``log:SCHEME SEED N``
+(the same from log weights). The answer is one line of JSON. First calls include compilation.
 """
 
 from __future__ import annotations

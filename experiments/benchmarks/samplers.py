@@ -1,8 +1,8 @@
 """Compare online smoothing and SMC samplers of this package and of `particles` 0.4, interleaved; writes samplers.csv.
 
-Each task is an example of `particles`: smoothed sums of an AR(1) process, the normal model and the logistic regression
-(Pima Indians) of its tutorials by tempering and IBIS, and stochastic volatility of exchange rates by SMC^2. README.md
-has the command.
+Each task is an example of `particles`: smoothed sums of an AR(1) process, the normal model and the logistic
+regression (Pima Indians) of its tutorials by tempering and IBIS, and stochastic volatility of exchange rates by
+SMC^2. README.md has the command.
 """
 
 from __future__ import annotations
@@ -107,8 +107,8 @@ def examples(package: Path | None) -> dict:
     pima = np.loadtxt(package / "datasets/pima-indians-diabetes.data", delimiter=",")
     X, signs = pima[:, :-1], 2 * pima[:, -1:] - 1
     X = np.hstack([np.ones((len(X), 1)), 0.5 * (X - X.mean(axis=0)) / X.std(axis=0)])
-    rates = np.loadtxt(package / "datasets/GBP_vs_USD_9798.txt", skiprows=2, usecols=3)
-    return {"logistic": (X * signs).tolist(), "sv": (100 * np.diff(np.log(rates[:31]))).tolist()}
+    rates = np.loadtxt(package / "datasets/GBP_vs_USD_9798.txt", skiprows=2, usecols=3, max_rows=31)
+    return {"logistic": (X * signs).tolist(), "sv": (100 * np.diff(np.log(rates))).tolist()}
 
 
 def main() -> None:

@@ -338,11 +338,13 @@ class _Step:
         population = past.realised()
         if self.filter.transition is None:
             return population.labelled(stayed)
-        fresh = {name: past.parents[name] for name in ("ancestor",) if name in past.parents}
+        given = stayed | {"ancestor": past.parents["ancestor"]} if "ancestor" in past.parents else stayed
         with self.slot("transition"):
-            moved = self.call("transition", "predict", population.labelled(fresh | stayed), self.y)
-        parents = moved.parents if len(moved) != len(population) else stayed | moved.parents
-        return moved.labelled({k: v for k, v in parents.items() if k != "ancestor"}, moved.notes)
+            moved = self.call("transition", "predict", population.labelled(given), self.y)
+        parents = {name: index for name, index in moved.parents.items() if name != "ancestor"}
+        if len(moved) == len(population):
+            parents.setdefault("previous", stayed["previous"])
+        return moved.labelled(parents, moved.notes)
 
     def propose(self) -> Population | None:
         """Particles drawn from the observation; None if the observation is missing."""

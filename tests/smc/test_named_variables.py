@@ -6,7 +6,7 @@ evidences. Evidences by 40 runs at 5 standard errors: false alarm below 1e-4 for
 
 from __future__ import annotations
 
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
@@ -33,7 +33,12 @@ from mstfilter.smc import (
 
 P0, MOVES = np.array([0.7, 0.3]), np.array([[0.9, 0.1], [0.4, 0.6]])
 SD = np.array([0.2, 1.5])
-YS = [{"seen": 0.3, "flag": True}, {"seen": None, "flag": False}, {"seen": 1.9, "flag": True}, {"seen": 1.5, "flag": None}]
+YS = [
+    {"seen": 0.3, "flag": True},
+    {"seen": None, "flag": False},
+    {"seen": 1.9, "flag": True},
+    {"seen": 1.5, "flag": None},
+]
 FLAG = np.array([0.2, 0.7])
 
 MODEL = StateSpaceModel.of(
@@ -47,10 +52,14 @@ def exact():
     """Log evidence, and the probability that the last regime is 1."""
     total, one = 0.0, 0.0
     for ks in product(range(2), repeat=4):
-        p = P0[ks[0]] * np.prod([MOVES[a, b] for a, b in zip(ks, ks[1:], strict=False)])
-        p *= np.prod([FLAG[k] if y["flag"] else 1 - FLAG[k] for k, y in zip(ks, YS, strict=True) if y["flag"] is not None])
+        p = P0[ks[0]] * np.prod([MOVES[a, b] for a, b in pairwise(ks)])
+        p *= np.prod(
+            [FLAG[k] if y["flag"] else 1 - FLAG[k] for k, y in zip(ks, YS, strict=True) if y["flag"] is not None]
+        )
         Q = SD[list(ks)][:, None, None] ** 2
-        p *= np.exp(kalman_filter([[0.9]], Q, [[1.0]], [[0.25]], [0.0], [[1.0]], [y["seen"] for y in YS]).log_evidence[-1])
+        p *= np.exp(
+            kalman_filter([[0.9]], Q, [[1.0]], [[0.25]], [0.0], [[1.0]], [y["seen"] for y in YS]).log_evidence[-1]
+        )
         total, one = total + p, one + p * ks[-1]
     return np.log(total), one / total
 

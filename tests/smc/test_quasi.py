@@ -55,9 +55,7 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_the_evidence_is_unbiased_and_has_less_variance(name):
     filter, ys, exact = CASES[name]
-    plain, quasi = (
-        np.array([f.run(ys, seed)[0].log_evidence for seed in range(24)]) for f in (filter, sqmc(filter))
-    )
+    plain, quasi = (np.array([f.run(ys, seed)[0].log_evidence for seed in range(24)]) for f in (filter, sqmc(filter)))
     ratio = np.exp(quasi - exact())
     assert abs(ratio.mean() - 1) < 5 * ratio.std(ddof=1) / np.sqrt(24)
     assert quasi.std() < 0.75 * plain.std()
@@ -104,9 +102,7 @@ def test_what_is_refused():
     ):
         with pytest.raises(InputError, match=message):
             sqmc(filter)
-    counts = StateSpaceModel(
-        lambda rng, n: rng.poisson(3.0, n), lambda rng, x: x, lambda x, y: -0.5 * (x - y) ** 2.0
-    )
+    counts = StateSpaceModel(lambda rng, n: rng.poisson(3.0, n), lambda rng, x: x, lambda x, y: -0.5 * (x - y) ** 2.0)
     with pytest.raises(InputError, match="a method that has no inverse"):
         sqmc(bootstrap(counts, 64)).run([1.0, 2.0], 0)
     uneven = StateSpaceModel(

@@ -1,8 +1,9 @@
 """SMC samplers against conjugate models and grids of Kalman evidences.
 
-z scores of the log evidence and of the posterior means over independent runs. Three cases run at every change with ten
-seeds, at |z| < 4 with 9 degrees of freedom (false alarm below 3 % for new seeds). All 15 run at night with 150, at |z|
-< 3 and room for the bias of order 1 / n (below 12 % for all).
+z scores of the log evidence and of the posterior means over independent runs. Three cases run at every change with
+ten seeds, at |z| < 4 with 9 degrees of freedom (false alarm below 3 % for new seeds). All 15 run at night with 150,
+at
+|z| < 3 and room for the bias of order 1 / n (below 12 % for all).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Smoothed sums over the path, while the observations arrive.
 
-Many questions about the past are sums over time: the number of jumps so far, the distance travelled, the statistics of
-the EM algorithm. For a sum S_t = h(x_0) + h(x_0, x_1) + .. + h(x_{t-1}, x_t), it is enough to keep for each particle
-the expectation of the sum given that the path ends there:
+Many questions about the past are sums over time: the number of jumps so far, the distance travelled, the statistics
+of the EM algorithm. For a sum S_t = h(x_0) + h(x_0, x_1) + .. + h(x_{t-1}, x_t), it is enough to keep for each
+particle the expectation of the sum given that the path ends there:
 
     S_t(x_t) = sum_i p_i (S_{t-1}(x_i) + h(x_i, x_t)),     p_i proportional to w_i f(x_t | x_i)
 
@@ -62,9 +62,9 @@ def additive(
     transition : DensityTransition, optional
         The transition of the model, ``Dynamics(model)``. Not needed for "genealogy".
     method : "paris", "forward" or "genealogy"
-        "paris" takes the mean over `draws` predecessors of each particle, at least 2 for a bounded variance. "forward"
-        computes the sums over all predecessors, with n^2 densities. "genealogy" takes the parent of each particle: it
-        needs no density, and its variance grows with the square of t.
+        "paris" takes the mean over `draws` predecessors of each particle, at least 2 for a bounded variance.
+        "forward" computes the sums over all predecessors, with n^2 densities. "genealogy" takes the parent of each
+        particle: it needs no density, and its variance grows with the square of t.
     backward, steps, log_bound
         How "paris" draws predecessors: `method` and the other arguments of `backward_paths`. With n particles, "mcmc"
         and "rejection" take a time proportional to n.

@@ -16,8 +16,8 @@ mean weight estimates the evidence, the integral of prior times likelihood (Del 
 >>> 0 < found.log_evidence_error < 0.1
 True
 
-- `tempering` goes through the powers L(theta)^e of the likelihood, from e = 0 to 1. Each next power is the one at which
-  the effective sample size falls to a share of n (Jasra, Stephens, Doucet, Tsagaris 2011).
+- `tempering` goes through the powers L(theta)^e of the likelihood, from e = 0 to 1. Each next power is the one at
+  which the effective sample size falls to a share of n (Jasra, Stephens, Doucet, Tsagaris 2011).
 - `ibis` takes the observations one by one (Chopin 2002). `smc2` does this for models of states, whose likelihood is
   estimated by particle filters.
 

@@ -21,6 +21,7 @@ filters are too noisy: then each filter is replaced by one with twice as many pa
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -75,8 +76,8 @@ def smc2(
     n : int
         Number of parameter vectors.
     batched : bool
-        Whether ``filter_of`` also accepts the parameters of all particles of all filters: arrays (m,), or (d, m) for a
-        vector. The filters then run in one sweep, which is much faster (`pmmh`).
+        Whether ``filter_of`` also accepts the parameters of all particles of all filters: arrays (m,), or (d, m) for
+        a vector. The filters then run in one sweep, which is much faster (`pmmh`).
     function : callable, optional
         ``(particles) -> (m, ...)`` of states x_t, whose means given y_0 .. y_t are estimated at every step
         (`Sampled.state_mean`).
@@ -105,6 +106,22 @@ class _Filters(Target):
     filter_of: FilterOf
     grow_below: float
     most_particles: int
+
+    @abstractmethod
+    def size(self, rows: Mapping[str, np.ndarray]) -> int | None:
+        """Number of particles of each filter; None before they are made."""
+
+    @abstractmethod
+    def stepper(self, theta: Any, n: int, size: int | None) -> Callable[..., Rows]:
+        """``(rng, rows, t, y) -> rows``: moves the filters of n parameter vectors by observation y_t."""
+
+    @abstractmethod
+    def states(self, population: Population) -> Population:
+        """The particles of all filters, weighted."""
+
+    @abstractmethod
+    def means(self, rows: Rows, function: Callable[[Any], np.ndarray]) -> np.ndarray:
+        """(n, k) the estimate of each filter for the mean of a function of the states."""
 
     def evaluate(self, rng: np.random.Generator, theta: Any, n: int, data: Any, like: Rows) -> Rows:
         return self._run(rng, theta, n, data, self.size(like))
@@ -145,12 +162,9 @@ class _Single(_Filters):
     """Filters that run one by one."""
 
     def size(self, rows: Mapping[str, np.ndarray]) -> int | None:
-        """Number of particles of each filter; None before they are made."""
         return rows[_RUN][0][0].n if _RUN in rows else None
 
     def stepper(self, theta: Any, n: int, size: int | None) -> Callable[..., Rows]:
-        """A function that moves the filters of n parameter vectors by one observation."""
-
         def step(rng: np.random.Generator, rows: Mapping[str, np.ndarray], t: int, y: Any) -> Rows:
             runs, found = np.empty(n, object), np.full(n, -np.inf)
             for i in range(n):
@@ -170,13 +184,11 @@ class _Single(_Filters):
         return step
 
     def states(self, population: Population) -> Population:
-        """The particles of all filters, weighted."""
         runs = [state.population for _, state in population.particles[_RUN]]
         lw = [a + p.log_weights - p.log_mean_weight for a, p in zip(population.log_weights, runs, strict=True)]
         return Population(_joined([p.particles for p in runs]), np.concatenate(lw))
 
     def means(self, rows: Rows, function: Callable[[Any], np.ndarray]) -> np.ndarray:
-        """(n, k) the estimate of each filter."""
         runs = [state.population for _, state in rows[_RUN]]
         return np.stack([p.weights @ np.reshape(function(p.particles), (len(p), -1)) for p in runs])
 
@@ -213,7 +225,8 @@ class _Swept(_Filters):
             assert population is not None
             found[alive] = log_mean
             found[rows[LOG_LIKELIHOOD] == -np.inf] = -np.inf
-            source = np.zeros(n, np.int64)  # a lost filter gets the particles of another one, and keeps its weight of 0
+            # A lost filter gets the particles of another one, and keeps its weight of 0.
+            source = np.zeros(n, np.int64)
             source[alive] = np.arange(len(alive))
             arrays = {_X: population.particles}
             if isinstance(population.particles, Mapping):

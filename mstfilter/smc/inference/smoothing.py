@@ -14,8 +14,8 @@ x_{t+1} with probability proportional to w_i f(x_{t+1} | x_i).
 
 `genealogy`, `fixed_lag` and `backward_paths` take a `Record` of any properly weighted filter and return a tuple with
 one population per time. The page "Smoothing" of the documentation compares them with `two_filter`, and with
-`additive`, which needs no record. `conditional_path` draws single paths of models and of programs. Reference: Godsill,
-Doucet, West (2004).
+`additive`, which needs no record. `conditional_path` draws single paths of models and of programs. Reference:
+Godsill, Doucet, West (2004).
 """
 
 from __future__ import annotations
@@ -126,8 +126,8 @@ def backward_paths(
         of "exact" up to an error of order 1 / N. Without accepted steps, the paths are those of `genealogy`.
 
         "rejection" (Douc, Garivier, Moulines, Olsson 2011) has the law of "exact", and needs `log_bound`. It draws by
-        w_i and accepts with probability f / bound. Rows that are hardly ever accepted are drawn as by "exact" (Dau and
-        Chopin 2023).
+        w_i and accepts with probability f / bound. Rows that are hardly ever accepted are drawn as by "exact" (Dau
+        and Chopin 2023).
     steps : int
         Number of Metropolis steps of "mcmc".
     log_bound : float, optional
@@ -160,10 +160,12 @@ class Backward:
         check_choice("method", self.method, get_args(BackwardMethod))
         check_integer("steps", self.steps)
         if self.method == "rejection" and self.log_bound is None:
-            raise InputError("the method rejection needs log_bound, an upper bound of the log density of the transition")
+            raise InputError(
+                "the method rejection needs log_bound, an upper bound of the log density of the transition"
+            )
 
     def moves(self, population: Population, later: Particles, observation: Any, t: int) -> Moves:
-        """The possible moves from a population at time t to particles at time t + 1, which have seen `observation`."""
+        """The possible moves from a population at time t to particles at time t + 1, which saw `observation`."""
         y, u = split_input(observation)
         return Moves(self, population, later, self.transition.at_step(t + 1, u), y, t)
 

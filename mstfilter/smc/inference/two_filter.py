@@ -142,7 +142,7 @@ class _OfReverse:
 
 
 @dataclass(frozen=True)
-class _Last(_OfReverse, Proposal):  # type: ignore[misc]
+class _Last(_OfReverse, Proposal):
     """Draws the last state from the artificial prior."""
 
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
@@ -150,7 +150,7 @@ class _Last(_OfReverse, Proposal):  # type: ignore[misc]
 
 
 @dataclass(frozen=True)
-class _Earlier(_OfReverse, Transition):  # type: ignore[misc]
+class _Earlier(_OfReverse, Transition):
     """Draws x_t given x_{t+1}, and weights by g(x_t) f(x_{t+1} | x_t) / (g(x_{t+1}) q)."""
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
@@ -163,7 +163,7 @@ class _Earlier(_OfReverse, Transition):  # type: ignore[misc]
 
 
 @dataclass(frozen=True)
-class _Weigh(_OfReverse, Update):  # type: ignore[misc]
+class _Weigh(_OfReverse, Update):
     """Weights by p(y_t | x_t)."""
 
     def update(

@@ -118,9 +118,9 @@ class SobolGenerator(np.random.Generator):
             "draw by random or standard_normal, and transform the numbers",
         )
 
-    integers = choice = permutation = permuted = shuffle = poisson = binomial = multinomial = _unknown  # type: ignore
-    gamma = beta = exponential = dirichlet = vonmises = multivariate_normal = bytes = _unknown  # type: ignore
-    lognormal = negative_binomial = geometric = _unknown  # type: ignore
+    integers = choice = permutation = permuted = shuffle = poisson = binomial = multinomial = _unknown
+    gamma = beta = exponential = dirichlet = vonmises = multivariate_normal = bytes = _unknown
+    lognormal = negative_binomial = geometric = _unknown
 
 
 class _Counting(SobolGenerator):
