@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import particles
@@ -23,7 +24,8 @@ from particles import (
 )
 from scipy import stats
 
-model = json.loads(sys.argv[1])
+given = sys.argv[1]  # a mapping, or @ and the name of a file that holds it
+model = json.loads(Path(given[1:]).read_text("utf-8") if given.startswith("@") else given)
 clock = time.process_time if model.get("clock") == "cpu" else time.perf_counter
 
 

@@ -10,7 +10,9 @@ from __future__ import annotations
 import argparse
 import json
 import subprocess
+import tempfile
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -121,14 +123,22 @@ def main() -> None:
     options = parser.parse_args()
     if options.smoke and options.out == HERE / "samplers.csv":
         parser.error("--smoke would overwrite the results: name another file with --out")
+    with ExitStack() as stack:
+        compare(options, stack)
+
+
+def compare(options: argparse.Namespace, stack: ExitStack) -> None:
+    """Run the tasks, and write the table."""
     worker, package = None, None
     if options.peers and not options.smoke:
         found = subprocess.check_output([options.peers, "-c", "import particles; print(particles.__path__[0])"])
         package = Path(found.decode().strip())
     given = examples(package) | {"toy": TOY.tolist()}
     if package is not None:
-        model = json.dumps({"rho": RHO, "sigma": SIGMA, "tau": TAU, "ys": YS, "clock": "cpu", **given})
-        command = [str(options.peers), str(HERE / "peers_worker.py"), model]
+        model = {"rho": RHO, "sigma": SIGMA, "tau": TAU, "ys": YS, "clock": "cpu", **given}
+        file = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "model.json"
+        file.write_text(json.dumps(model))
+        command = [str(options.peers), str(HERE / "peers_worker.py"), f"@{file}"]
         worker = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
     def peer(command: str, seed: int, n: int) -> dict:

@@ -153,9 +153,10 @@ def scores(name, seeds):
     # The order of the bias is that of the variance.
     bias = np.array([spread[0] ** 2, *(spread[1:] * spread[0])]) * (0.0 if "fixed" in name else 0.5)
     found = np.maximum(abs(away.mean(axis=0)) - bias, 0.0) / (spread / np.sqrt(len(runs)))
-    errors = np.array([[found.log_evidence_error, *error] for found, _, error in runs])
-    logs = np.array([found.log_evidence for found, _, _ in runs])
-    return found, np.mean(errors**2, axis=0) / np.append(logs.var(ddof=1), spread[1:] ** 2)
+    # The estimated variance of the log evidence may be negative in a single run.
+    variances = [[one.run.log_evidence_variance[-1], *error**2] for one, _, error in runs]
+    logs = np.array([one.log_evidence for one, _, _ in runs])
+    return found, np.mean(variances, axis=0) / np.append(logs.var(ddof=1), spread[1:] ** 2)
 
 
 @pytest.mark.parametrize("name", ["tempering, waste-free", "ibis, unequal weights", "smc2"])
