@@ -203,7 +203,7 @@ def pmmh(
     theta = np.atleast_2d(_numbers("start", start))
     if theta.ndim > 2:
         raise InputError(f"start has shape {theta.shape}, expected (d,) or (chains, d)")
-    root = step_root(scale, theta.shape[1])
+    root = _step_root(scale, theta.shape[1])
     check_integer("n_iterations", n_iterations)
     posterior = _Posterior(filter_of, list(check_observations(observations)), log_prior, batched)
     key = Key(seed).child("pmmh")
@@ -257,7 +257,7 @@ def _numbers(name: str, value: Any) -> np.ndarray:
     return numbers
 
 
-def step_root(scale: Any, d: int) -> np.ndarray:
+def _step_root(scale: Any, d: int) -> np.ndarray:
     """(d, d) square root of the covariance of a step, from standard deviations or a covariance."""
     scale = _numbers("scale", scale)
     if scale.ndim < 2 and scale.shape in ((), (1,), (d,)) and np.isfinite(scale).all() and (scale > 0).all():

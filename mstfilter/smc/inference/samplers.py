@@ -46,7 +46,7 @@ from mstfilter.smc.components import Always, EssBelow
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.inference.diagnostics import RunVariance, run_variance
 from mstfilter.smc.inference.metropolis import metropolis
-from mstfilter.smc.inference.parameters import step_root
+from mstfilter.smc.inference.parameters import _step_root
 from mstfilter.smc.inputs import bind_step, check_observations, check_signature, split_input, step_parameters
 from mstfilter.smc.interfaces import Distribution, Proposal, Resampler, Size, State, Transition, Trigger, Update
 from mstfilter.smc.models.distributions import as_distribution
@@ -320,7 +320,7 @@ class Sampler:
         filter = ParticleFilter(
             initial=_FromPrior(theta, self.target),
             transition=_Moves(theta, self.target, self.steps, self.waste_free),
-            update=_Extend(theta, self.target, None if self.scale is None else step_root(self.scale, d)),
+            update=_Extend(theta, self.target, None if self.scale is None else _step_root(self.scale, d)),
             resampler=resampler,
             trigger=self.trigger,
             n=self.n,
