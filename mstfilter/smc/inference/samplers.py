@@ -97,7 +97,7 @@ def tempering(
     waste_free: bool = True,
     scale: Any = None,
     resampler: Resampler = Systematic(),  # noqa: B008 (frozen)
-    lag: int | None = None,
+    lag: int | None = 5,
 ) -> Sampled:
     """Draw from a posterior by powers of the likelihood that increase from 0 to 1.
 
@@ -122,7 +122,8 @@ def tempering(
         Standard deviations or covariance of a step, with parameters in the order of the prior. By default,
         2.38^2 / d times the covariance of the particles (Roberts, Gelman, Gilks 1997).
     lag : int, optional
-        For the standard error, see `run_variance`.
+        Number of steps whose ancestors the standard errors use (`run_variance`): None for all, which has no bias from
+        the lag and more noise.
 
     Raises
     ------
