@@ -168,7 +168,9 @@ def tables(rows: Sequence[dict[str, Any]], out: Path) -> list[dict[str, Any]]:
 def main() -> None:
     """Ask all questions, then write the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("overrides", nargs="*", metavar="PATH=VALUE", help="changes to every preset; {share} is filled")
+    parser.add_argument(
+        "overrides", nargs="*", metavar="PATH=VALUE", help="changes to every preset; {share} is filled"
+    )
     parser.add_argument("--presets", default=PRESETS)
     parser.add_argument("--families", default=FAMILIES)
     parser.add_argument("--shares", default=SHARES)

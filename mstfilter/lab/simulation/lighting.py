@@ -84,7 +84,9 @@ class _Shared(NamedTuple):
     """Which points share shadow rays."""
 
     first: np.ndarray  #: (n,) the first point of the block and geom of each point, or itself if that one is not near
-    beside: np.ndarray  #: (n, 4) the first points of the same geom in the blocks beside, or `first` where there is none
+    beside: (
+        np.ndarray
+    )  #: (n, 4) the first points of the same geom in the blocks beside, or `first` where there is none
 
     @classmethod
     def of(cls, block: np.ndarray, stride: int, geom: np.ndarray, points: np.ndarray) -> _Shared:

@@ -23,8 +23,8 @@ twice, are not modelled. Sources of the constants:
   Workshops, 2017, of their predecessor.
 - Azure Kinect: Microsoft's hardware specification (narrow field of view: 0.5 to 3.86 m, standard deviation at most
   17 mm); Tölgyessy, Dekan, Chovanec and Hubinský, "Evaluation of the Azure Kinect and its comparison to Kinect v1 and
-  Kinect v2", Sensors 21(2), 2021, confirms this bound and describes flying pixels and dark materials. The focal length
-  is that of factory calibrations (0.49 of 1024 pixels; microsoft/Azure-Kinect-Sensor-SDK, issue 1617).
+  Kinect v2", Sensors 21(2), 2021, confirms this bound and describes flying pixels and dark materials. The focal
+  length is that of factory calibrations (0.49 of 1024 pixels; microsoft/Azure-Kinect-Sensor-SDK, issue 1617).
 - L515: Intel RealSense LiDAR camera L515 datasheet, revision 003 (field of view 70 degrees, 0.25 to 9 m, standard
   deviation 2.5 mm at 1 m and 15.5 mm at 9 m on a surface that reflects 95 % of the light; ours is 22.5 mm at 9 m).
 

@@ -267,7 +267,7 @@ def test_shared_shadow_rays_change_no_border_of_a_shadow(folder):
     own = scene._renderer.render().colour
     body = scene._renderer.render().instance > 0
     differs = np.abs(shared - own).max(axis=-1)[body] > 0.02
-    assert 0 < body.sum() and differs.mean() < 0.002  # blocks alone: .009
+    assert body.any() and differs.mean() < 0.002  # blocks alone: .009
 
 
 @pytest.mark.nightly
