@@ -106,7 +106,7 @@ class MeshObject:
         # Wood, filled packages and porcelain: 0.7 g a cubic centimetre of the body, thin walls are denser.
         thin = surface.volume / float(8 * np.prod(surface.half)) < 0.15
         mass = float(np.clip((2000.0 if thin else 700.0) * volume, 0.02, 1.5))
-        return Shape.of_surface(surface, scale, self.kind, self.name, mass, _finish(self.kind, surface.half))
+        return Shape.of_surface(surface, scale, self.kind, self.name, mass, _finish(self.kind, surface.half, thin))
 
 
 @functools.lru_cache(maxsize=512)
@@ -114,8 +114,13 @@ def _prepared(triangles: Triangles) -> MeshSurface:
     return prepared_mesh(triangles, cache_folder() / "objects", AGREEMENT)
 
 
-def _finish(kind: str, half: np.ndarray) -> tuple[str, ...]:
-    """Styles of texture of an object without colours. Labels need an object that is as wide as deep."""
+def _finish(kind: str, half: np.ndarray, thin: bool) -> tuple[str, ...]:
+    """Styles of texture of an object without colours.
+
+    Labels need an object that is as wide as deep. An open box, which has `thin` walls, has no print.
+    """
+    if kind == "box" and thin:
+        return ("plain",)
     round_ = 0.9 < half[0] / half[1] < 1.1
     found = _FINISHES.get(kind, _FINISHES["other"])
     return found if round_ or found != ("label",) else ("plain",)

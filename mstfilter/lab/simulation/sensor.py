@@ -29,7 +29,7 @@ twice, are not modelled. Sources of the constants:
   deviation 2.5 mm at 1 m and 15.5 mm at 9 m on a surface that reflects 95 % of the light; ours is 22.5 mm at 9 m).
 
 Shares of lost and flying pixels, the darkest surface and the standard deviation of the Azure Kinect at 1 m are
-assumptions, except for the Xtion. The correlation of stereo noise is that of a matching window of about 7 pixels.
+assumptions, except for the Xtion; only the L515 loses the black ink of prints. The correlation of stereo noise is that of a matching window of about 7 pixels.
 
 The colour camera has optical blur, photon noise and the sRGB curve.
 
@@ -200,15 +200,15 @@ SENSORS: dict[str, DepthSensor] = {
     "xtion": DepthSensor(),
     "d415": DepthSensor(
         lateral=0.8, edge_dropout=0.25, fill=1.0, focal=615.0, baseline=0.055, quantum=0.019, noise=0.049,
-        correlation=1.5, flying=0.10, darkest=0.015, shiny=0.3, grazing=1.45, nearest=0.45, farthest=10.0,
+        correlation=1.5, flying=0.10, darkest=0.006, shiny=0.3, grazing=1.45, nearest=0.45, farthest=10.0,
     ),
     "d435": DepthSensor(
         lateral=1.2, edge_dropout=0.25, fill=1.0, focal=615.0, baseline=0.050, quantum=0.043, noise=0.110,
-        correlation=2.5, flying=0.15, darkest=0.015, shiny=0.3, grazing=1.45, nearest=0.17, farthest=10.0,
+        correlation=2.5, flying=0.15, darkest=0.006, shiny=0.3, grazing=1.45, nearest=0.17, farthest=10.0,
     ),
     "azure": DepthSensor(
         lateral=0.3, edge_dropout=0.30, fill=0.0, focal=505.0, baseline=0.0, axial=0.0015, flying=0.35,
-        darkest=0.03, shiny=0.5, grazing=1.4, nearest=0.5, farthest=3.86,
+        darkest=0.012, shiny=0.5, grazing=1.4, nearest=0.5, farthest=3.86,
     ),
     "l515": DepthSensor(
         lateral=0.3, edge_dropout=0.20, fill=0.0, focal=600.0, baseline=0.0, axial=0.0025, flying=0.20,
