@@ -101,8 +101,8 @@ class SceneFamily(Bounded):
     object_scale: PositiveFloat = 1.0  #: factor of the lengths in the files of meshes, 0.001 for millimetres
     object_up: Literal["auto", "y", "z"] = "auto"  #: axis that points up in the files; "auto": y for glTF, else z
     n_dropped: NonNegativeInt = 0  #: objects that fall into, onto or against another object
-    #: Probability that an object stands at any free place of the table in view, instead of beside another object. Twins
-    #: and objects that are stacked, hidden or dropped stand where they have to.
+    #: Probability that an object stands at any free place of the table in view, instead of beside another object.
+    #: Twins and objects that are stacked, hidden or dropped stand where they have to.
     apart: Share = 0.0
     furniture: Share = 0.0  #: probability that a wall, a board or a tray is in view
     groups: Literal["", "row", "stack", "pack"] = ""  #: how the objects of a group stand

@@ -29,7 +29,8 @@ twice, are not modelled. Sources of the constants:
   deviation 2.5 mm at 1 m and 15.5 mm at 9 m on a surface that reflects 95 % of the light; ours is 22.5 mm at 9 m).
 
 Shares of lost and flying pixels, the darkest surface and the standard deviation of the Azure Kinect at 1 m are
-assumptions, except for the Xtion; only the L515 loses the black ink of prints. The correlation of stereo noise is that of a matching window of about 7 pixels.
+assumptions, except for the Xtion; only the L515 loses the black ink of prints. The correlation of stereo noise is
+that of a matching window of about 7 pixels.
 
 The colour camera has optical blur, photon noise and the sRGB curve.
 
