@@ -68,6 +68,7 @@ from mstfilter.smc.interfaces import (
     Update as Update,
     WeightResampler as WeightResampler,
 )
+from mstfilter.smc.models.combined import Mixture as Mixture, Product as Product, Truncated as Truncated
 from mstfilter.smc.models.distributions import (
     Bernoulli as Bernoulli,
     Categorical as Categorical,
@@ -84,6 +85,15 @@ from mstfilter.smc.models.exact import (
     hidden_markov as hidden_markov,
     kalman_filter as kalman_filter,
     linear_gaussian as linear_gaussian,
+)
+from mstfilter.smc.models.families import (
+    Beta as Beta,
+    Binomial as Binomial,
+    Dirichlet as Dirichlet,
+    Gamma as Gamma,
+    LogNormal as LogNormal,
+    Poisson as Poisson,
+    VonMises as VonMises,
 )
 from mstfilter.smc.models.gaussian import (
     ConditionallyLinear as ConditionallyLinear,
