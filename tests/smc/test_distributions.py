@@ -47,8 +47,10 @@ CASES = [
     (Truncated(Normal(), 9.0, 9.5), stats.truncnorm(9.0, 9.5)),
     (Truncated(Normal(), -9.5, -9.0), stats.truncnorm(-9.5, -9.0)),
     (Truncated(stats.expon(scale=2.0), 0.5), stats.expon(0.5, 2.0)),
-    (Mixture([1, 3], [Categorical([1.0]), Binomial(3, 0.5)]), stats.rv_discrete(
-        values=(np.arange(4), [0.25 + 3 / 32, 9 / 32, 9 / 32, 3 / 32]))),
+    (
+        Mixture([1, 3], [Categorical([1.0]), Binomial(3, 0.5)]),
+        stats.rv_discrete(values=(np.arange(4), [0.25 + 3 / 32, 9 / 32, 9 / 32, 3 / 32])),
+    ),
 ]
 IDS = [type(ours).__name__ for ours, _ in CASES]
 

@@ -236,7 +236,10 @@ class Product(Distribution):
     def parameter_shape(self) -> tuple[int, ...]:
         if self.names:
             raise InputError("the values of a Product of named variables are mappings, which have no shape")
-        return (*(_broadcast_shape(*(np.empty(part.parameter_shape) for part in self.parts)) or (1,)), len(self.parts))
+        return (
+            *(_broadcast_shape(*(np.empty(part.parameter_shape) for part in self.parts)) or (1,)),
+            len(self.parts),
+        )
 
     def check_parameters(self) -> None:
         for part in self.__dict__["_by_key"].values():
