@@ -20,12 +20,18 @@ from mstfilter.smc.diverse_resampling import (
 from mstfilter.smc.filter import ParticleFilter as ParticleFilter
 from mstfilter.smc.history import (
     History as History,
+    circular_mean as circular_mean,
     collect as collect,
+    covariance as covariance,
     ess as ess,
     log_evidence as log_evidence,
     mean as mean,
+    particles as particles,
+    quantiles as quantiles,
     resampled as resampled,
     unique_ancestors as unique_ancestors,
+    variance as variance,
+    weights as weights,
 )
 from mstfilter.smc.inference.conditional import conditional_path as conditional_path, path_log_prob as path_log_prob
 from mstfilter.smc.inference.diagnostics import (

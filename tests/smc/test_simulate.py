@@ -1,6 +1,6 @@
 """Simulated data have the law of the model: joint moments, Kalman filters, enumeration and ranks of the truth.
 
-Statistical tests compare with exact values at |z| < 4.5 or p > 1e-4: with the fixed seeds, they cannot fail by chance,
+Statistical tests compare with exact values at |z| < 4.5 or p > 1e-4. With the fixed seeds they cannot fail by chance,
 and a change of streams fails one with a probability below 1e-3.
 """
 

@@ -216,7 +216,7 @@ class Product(Distribution):
         named = isinstance(self.parts, Mapping)
         given = dict(self.parts) if named else dict(enumerate(self.parts))
         parts = {name: as_distribution(part) for name, part in given.items()}
-        if not parts or not named and any(part.event_shape for part in parts.values()):
+        if not parts or (not named and any(part.event_shape for part in parts.values())):
             raise InputError(
                 f"the parts of a Product have event shapes {[part.event_shape for part in parts.values()]}, expected "
                 "one or more distributions of numbers",

@@ -20,10 +20,10 @@ family        density or probability                                     values
 `VonMises`    exp(c cos(x - m)) / (2 pi I_0(c))                          angles, in radians
 ============  =========================================================  =================================
 
-The functions of scipy.special evaluate them and numpy draws them, because a frozen distribution of scipy.stats has to
-be made anew at each step, which alone takes 0.7 ms. With 100 particles, such a step takes ten to fifty times as long as
-with a family of this module, with 100,000 about twice as long. Every other family of scipy.stats can be used at that
-price.
+The functions of scipy.special evaluate them and numpy draws them, because a frozen distribution of scipy.stats has
+to be made anew at each step, which alone takes 0.7 ms. With 100 particles, such a step takes ten to fifty times as
+long as with a family of this module, with 100,000 about twice as long. Every other family of scipy.stats can be used
+at that price.
 """
 
 from __future__ import annotations

@@ -7,8 +7,8 @@
 ((50,), (50,))
 >>> state, infos = bootstrap(model, n=1000).run(ys, seed=0)
 
-A filter that is judged by such data is judged where its model is true. `simulate` draws from streams of its own, so the
-filter may have the same seed. The first T steps do not depend on how many follow.
+A filter that is judged by such data is judged where its model is true. `simulate` draws from streams of its own, so
+the filter may have the same seed. The first T steps do not depend on how many follow.
 """
 
 from __future__ import annotations
