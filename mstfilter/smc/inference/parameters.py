@@ -12,8 +12,8 @@ a model with parameters is a function that returns a filter, and the prior is a 
 >>> chains = pmmh(filter_of, observations, prior, scale={"rho": 0.1, "sigma": 0.1}, n_iterations=5000)
 >>> chains["rho"][1000:].mean(), chains.autocorrelation_times()
 
-Without names, parameters are an array (d,): then the prior is a distribution of vectors, or a function that returns the
-log density, and `start` and `scale` are arrays.
+Without names, parameters are an array (d,): then the prior is a distribution of vectors, or a function that returns
+the log density, and `start` and `scale` are arrays.
 
 - `pmmh` is such a Metropolis chain.
 - `ensemble` runs the ensemble sampler emcee with the same estimates. It needs no scale of the steps.

@@ -7,8 +7,9 @@ is from the truth:
 >>> import numpy as np
 >>> from mstfilter.smc import bootstrap, kalman_filter, linear_gaussian
 >>> model = {"F": [[0.9]], "Q": [[0.25]], "H": [[1.0]], "R": [[1.0]], "m0": [0.0], "P0": [[1.0]]}
->>> exact = kalman_filter(**model, observations=[0.3, -0.1, 0.8])
->>> state, _ = bootstrap(linear_gaussian(**model), n=10_000).run([0.3, -0.1, 0.8], seed=0)
+>>> states, ys = linear_gaussian(**model).simulate(20, seed=1)
+>>> exact = kalman_filter(**model, observations=ys)
+>>> state, _ = bootstrap(linear_gaussian(**model), n=10_000).run(ys, seed=0)
 >>> bool(abs(state.log_evidence - exact.log_evidence[-1]) < 0.05)
 True
 
