@@ -153,6 +153,15 @@ def test_functions_of_objects_time_and_inputs():
     k = states[0][1]
     assert states == (("start", k), ("b", k + 1), ("c", k + 3))
     assert [(y.y, y.u) for y in ys] == [(k, "a"), (11 + k, "b"), (23 + k, "c")]
+    several = StateSpaceModel(
+        lambda rng, n: {"x": rng.normal(size=n), "v": rng.normal(size=(n, 2))},
+        lambda rng, p: {"x": p["x"] + 1.0, "v": p["v"]},
+        lambda p, y: np.zeros(len(p["x"])),
+        sample_observation=lambda rng, p: {"a": p["x"], "b": p["v"]},
+    )
+    states, ys = several.simulate(3)
+    assert states["x"].shape == (3,) and states["v"].shape == (3, 2) and states["x"][2] == states["x"][0] + 2.0
+    assert [y["a"] for y in ys] == states["x"].tolist() and ys[1]["b"].shape == (2,)
     with pytest.raises(InputError, match="there are 2 inputs for 3 steps"):
         model.simulate(3, inputs="ab")
     with pytest.raises(InputError, match="n_steps is 0"):

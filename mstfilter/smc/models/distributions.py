@@ -18,9 +18,9 @@ log density of a row that is out of range is NaN: an update refuses it, and a Me
 parameters, rejects it.
 
 More families are in `mstfilter.smc.models.families`, and mixtures, truncated distributions and products in
-`mstfilter.smc.models.combined`. Frozen distributions of scipy.stats, such as ``stats.cauchy(x)``, can be used in their
-place (`as_distribution`), but are slower. For a distribution of another library, write a `Distribution` whose `sample`
-draws from the given generator.
+`mstfilter.smc.models.combined`. Frozen distributions of scipy.stats, such as ``stats.cauchy(x)``, can be used in
+their place (`as_distribution`), but are slower. For a distribution of another library, write a `Distribution` whose
+`sample` draws from the given generator.
 """
 
 from __future__ import annotations

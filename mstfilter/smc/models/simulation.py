@@ -46,6 +46,11 @@ def simulated(step: Step, n_steps: int, seed: int, inputs: Iterable[Any] | None)
     return _joined(states), _stacked(ys)
 
 
+def first_row(ys: Any) -> Any:
+    """The first of several observations: an array or list of them, or a mapping of arrays."""
+    return {name: a[0] for name, a in ys.items()} if isinstance(ys, Mapping) else ys[0]
+
+
 def _joined(states: list[Any]) -> Particles:
     """States of all steps, from particles of one row. Variables that some step lacks are left out."""
     if isinstance(states[0], np.ndarray):

@@ -60,7 +60,7 @@ from mstfilter.smc.interfaces import (
     Trigger,
 )
 from mstfilter.smc.models.distributions import as_distribution
-from mstfilter.smc.models.simulation import simulated
+from mstfilter.smc.models.simulation import first_row, simulated
 from mstfilter.smc.population import Particles, Population, count_particles, take
 from mstfilter.smc.resampling import Systematic
 
@@ -163,7 +163,7 @@ class StateSpaceModel(AtStep):
                     "give StateSpaceModel a function sample_observation(rng, particles), or use .of()",
                 )
             x = at.sample_initial(rng, 2) if x is None else at.sample_transition(rng, x)
-            return x, at.sample_observation(rng, x)[0]
+            return x, first_row(at.sample_observation(rng, x))
 
         return simulated(step, n_steps, seed, inputs)
 
