@@ -12,7 +12,7 @@ They are methods of a population, and collectors of the same names record them a
 >>> population.quantiles([0.25, 0.5, 0.75])["x"]                       # one row for each level
 array([0., 1., 1.])
 >>> round(float(population.circular_mean()["heading"]), 3)             # and not -1.55, the mean of the numbers
--3.117
+-3.121
 
 With weights W_i that sum to one, the mean is sum_i W_i x_i and the variance sum_i W_i (x_i - mean)^2, entry by entry.
 The quantile of level p is the smallest particle such that it and all smaller ones have at least the weight p, so it

@@ -5,8 +5,8 @@
 >>> heavy = Mixture([0.95, 0.05], [Normal(0.0, 1.0), Normal(0.0, 10.0)])        # one reading in twenty is an outlier
 >>> positive = Truncated(Normal(0.0, 1.0), low=0.0)
 >>> prior = Product({"rho": Uniform(-1.0, 1.0), "sigma": Gamma(2.0, 0.5)})      # as `pmmh` takes it
->>> sorted(prior.sample(np.random.default_rng(0), 3)), prior.log_prob({"rho": 0.5, "sigma": 1.0}).round(3)
-(['rho', 'sigma'], array(-1.307))
+>>> sorted(prior.sample(np.random.default_rng(0), 3)), round(float(prior.log_prob({"rho": 0.5, "sigma": 1.0})), 3)
+(['rho', 'sigma'], -1.307)
 
 The parts are distributions of this package or frozen ones of scipy.stats. Their parameters may have one row per
 particle, as may the weights of a mixture and the bounds of a truncated distribution.
