@@ -17,6 +17,7 @@ from mstfilter.smc import (
     Normal,
     Population,
     Program,
+    StateSpaceModel,
     Uniform,
     bootstrap,
     circular_mean,
@@ -286,6 +287,15 @@ def test_runs_plot_the_spread_over_seeds():
     assert [axis.get_ylabel() for axis in program.axes] == ["mean_x[0]", "mean_x[1]", "mean_angle"]
     with pytest.raises(InputError, match="no values to plot"):
         collect([]).plot()
+
+
+def test_lost_runs_are_left_out_of_a_band():
+    model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(x, 1.0), lambda x: Uniform(x - 1.0, x + 1.0))
+    runs = run_many(bootstrap(model, 2), [0.1, 0.3, -0.2], range(30), log_evidence=log_evidence)
+    assert 0 < len(runs.lost) < 30
+    (median,) = lines(runs.plot().axes[0])
+    finite = np.where(np.isfinite(runs["log_evidence"]), runs["log_evidence"], np.nan)
+    np.testing.assert_allclose(median, np.nanmedian(finite, axis=0))
 
 
 def test_filters_are_compared_by_their_errors():

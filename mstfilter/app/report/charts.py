@@ -90,7 +90,8 @@ def _panels(history: Any, name: str, band: float, truth: Any) -> list[tuple[str,
     if "seed" in history.dims:
         if levels is not None:  # the spread of the median over seeds
             values = values[:, :, :, int(np.argmin(np.abs(np.subtract(levels, 0.5))))]
-        lost = np.isnan(values).all(axis=1, keepdims=True)
+        values = np.where(np.isfinite(values), values, np.nan)  # without lost runs
+        lost: Any = np.isnan(values).all(axis=1, keepdims=True)
         drawn = np.nanquantile(np.where(lost, 0.0, values), [edges[0], 0.5, edges[1]], axis=1)
         low, middle, high = np.where(lost[:, 0], np.nan, drawn)
     elif levels is not None:

@@ -254,7 +254,7 @@ class Product(Distribution):
             found = list(value) if isinstance(value, Mapping) else type(value).__name__
             raise InputError(f"the variables of a Product are {list(self.names)}, found {found}")
         values = value if self.names else dict(enumerate(np.moveaxis(np.asarray(value), -1, 0)))
-        return sum(part.log_prob(values[key]) for key, part in self.__dict__["_by_key"].items())  # type: ignore
+        return sum(part.log_prob(values[key]) for key, part in self.__dict__["_by_key"].items())
 
     @property
     def mean(self) -> Any:

@@ -273,11 +273,9 @@ class Dirichlet(_Checked):
         x, a = np.asarray(value, np.float64), self.concentration
         with np.errstate(all="ignore"):
             found = xlogy(a - 1.0, x).sum(axis=-1) + gammaln(a.sum(axis=-1)) - gammaln(a).sum(axis=-1)
-        total = x.sum(axis=-1)
+        total, valid = x.sum(axis=-1), np.asarray(self.ranges["concentration"].contains(a).all(axis=-1))
         inside = (x >= 0).all(axis=-1) & (abs(total - 1.0) < 1e-6)
-        return _where(
-            self.ranges["concentration"].contains(a).all(axis=-1), np.where(inside, found, _impossible(total))
-        )
+        return _where(valid, np.where(inside, found, _impossible(total)))
 
     @property
     def mean(self) -> np.ndarray:
