@@ -500,12 +500,11 @@ def test_names_of_parameters_are_kept():
 def test_first_parameters_are_draws_from_the_prior():
     one = pmmh(named_filter, YS, PRIOR, scale={"rho": 1e-9, "tau": 1e-9}, n_iterations=1)
     assert one.theta.shape == (1, 1, 2) and one["tau"] > 0
-    many = pmmh(
-        named_filter, YS, PRIOR, Product(PRIOR).sample(np.random.default_rng(0), 3), [0.1, 0.1], 2, batched=True
-    )
+    many = pmmh(named_filter, YS, PRIOR, scale=[0.1, 0.1], n_iterations=2, n_chains=3, batched=True)
     assert many.theta.shape == (2, 3, 2)
     walkers = ensemble(named_filter, YS, PRIOR, n_iterations=2)
     assert walkers.theta.shape == (2, 8, 2) and walkers.names == ("rho", "tau")
+    assert ensemble(named_filter, YS, PRIOR, n_iterations=1, n_walkers=6).theta.shape == (1, 6, 2)
     vectors = pmmh(
         lambda theta: filter_of(theta[:1]), YS, Product([*PRIOR.values()]), scale=[0.1, 0.1], n_iterations=2
     )

@@ -149,13 +149,13 @@ class _Parameters:
         """What `filter_of` and the prior get: a mapping from names to entries of ``theta``, or the array itself."""
         return dict(zip(self.names, theta, strict=True)) if self.names else theta
 
-    def start(self, given: Any, n: int, rng: np.random.Generator) -> np.ndarray:
-        """(R, d) first parameters. Without any, `n` draws from the prior; 0 stands for 4 d."""
+    def start(self, given: Any, n: int | None, rng: np.random.Generator) -> np.ndarray:
+        """(R, d) first parameters. Without any, `n` draws from the prior; None stands for 4 d."""
         if given is not None:
             return np.atleast_2d(self.vector("start", given))
         if self.prior is None:
             raise InputError("start is missing", "only a prior that is a distribution can be drawn from")
-        if n == 0:
+        if n is None:
             n = 4 * np.shape(self.vector("the prior", self.prior.sample(rng, 1)))[-1]
         drawn = self.vector("the prior", self.prior.sample(rng, n))
         return drawn if drawn.ndim == 2 else drawn[:, None]
@@ -273,6 +273,7 @@ def pmmh(
     n_iterations: int = 1000,
     seed: int = 0,
     *,
+    n_chains: int = 1,
     batched: bool = False,
 ) -> Chains:
     """Particle marginal Metropolis-Hastings: a random walk on the parameters.
@@ -290,8 +291,7 @@ def pmmh(
         scipy.stats; or a function ``(theta) -> float``, the log density, -inf outside of the support.
     start : mapping, (d,) or (R, d) array_like, optional
         First parameters of one chain or of R chains: numbers or arrays (R,) by name, or an array in the order in
-        which `filter_of` takes them. By default one chain starts at a draw from the prior;
-        ``Product(prior).sample(rng, R)`` starts R of them.
+        which `filter_of` takes them. By default, `n_chains` chains start at draws from the prior.
     scale : mapping, (d,) or (d, d) array_like
         Standard deviations or covariance of a step. A good choice is 2.4 / sqrt(d) posterior standard deviations.
     batched : bool
@@ -306,7 +306,8 @@ def pmmh(
         If the prior is zero at the start of a chain, or if 20 estimates of the evidence at the start are zero.
     """
     parameters, key = _Parameters(prior, start), Key(seed).child("pmmh")
-    theta = parameters.start(start, 1, key.child("prior").generator())
+    check_integer("n_chains", n_chains)
+    theta = parameters.start(start, n_chains, key.child("prior").generator())
     if theta.ndim > 2:
         raise InputError(f"start has shape {theta.shape}, expected (d,) or (chains, d)")
     if scale is None:
@@ -387,6 +388,7 @@ def ensemble(
     n_iterations: int = 1000,
     seed: int = 0,
     *,
+    n_walkers: int | None = None,
     batched: bool = False,
 ) -> Chains:
     """Ensemble MCMC (Goodman and Weare 2010) by emcee, with the estimated evidence as the likelihood.
@@ -399,13 +401,13 @@ def ensemble(
     filter_of, observations, prior, batched
         As in `pmmh`. If `batched` is True, the filters of half of the walkers run as one batch.
     start : mapping of (n_walkers,) arrays or (n_walkers, d) array_like, optional
-        First parameters of the walkers. At least 2 d walkers are needed, with different parameters. By default, 4 d
-        walkers start at draws from the prior.
+        First parameters of the walkers. At least 2 d walkers are needed, with different parameters. By default,
+        `n_walkers` (or 4 d) walkers start at draws from the prior.
     """
     import emcee
 
     parameters, key = _Parameters(prior, start), Key(seed).child("ensemble")
-    theta = parameters.start(start, 0, key.child("prior").generator())
+    theta = parameters.start(start, n_walkers, key.child("prior").generator())
     if theta.ndim != 2 or len(theta) < 2 * theta.shape[1]:
         raise InputError(f"start has shape {theta.shape}, expected (walkers, d) with at least 2 d walkers")
     check_integer("n_iterations", n_iterations)

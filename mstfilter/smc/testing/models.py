@@ -51,8 +51,8 @@ _STEPS, _PARTICLES, _SEED = 20, 200, 1
 class ModelContract(ExactContract):
     """The contract of a `StateSpaceModel`, a `Program`, the function of a program, or a filter made of one of them.
 
-    `observations` are the observations of a run. Without them, they are drawn from the model, which needs
-    `StateSpaceModel.of`, a field `sample_observation`, or a program with one `observe`.
+    `observations` are the observations of a run. Without them, they are drawn from the model by its
+    method `simulate`.
     """
 
     observations: ClassVar[Sequence[Any] | None] = None
