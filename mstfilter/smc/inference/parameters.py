@@ -368,6 +368,7 @@ def _numbers(name: str, value: Any) -> np.ndarray:
 
 def _step_root(scale: Any, d: int) -> np.ndarray:
     """(d, d) square root of the covariance of a step, from standard deviations or a covariance."""
+    scale = _numbers("scale", scale)
     if scale.ndim < 2 and scale.shape in ((), (1,), (d,)) and np.isfinite(scale).all() and (scale > 0).all():
         return np.diag(np.broadcast_to(scale, d))
     try:
