@@ -169,10 +169,10 @@ class Differences(dict[str, Difference]):
     def __str__(self) -> str:
         return "\n".join(conclusion(d, arm, self.reference, self.label, self.unit) for arm, d in self.items())
 
-    plot = late("mstfilter.app.report.charts:plot_differences", "Differences with their intervals.")
+    plot = late("mstfilter.app.report.charts:draw_differences", "Differences with their intervals.")
 
 
-plot_differences = late("mstfilter.app.report.charts:plot_differences", "Differences with their intervals.")
+plot_differences = late("mstfilter.app.report.charts:draw_differences", "Differences with their intervals.")
 
 
 def compare_arms(table: Mapping[str, Values], reference: str, unit: str = "unit") -> Differences:

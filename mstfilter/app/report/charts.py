@@ -2,7 +2,7 @@
 
 >>> history.plot(band=0.9, x=states)                 # the quantiles that were collected as x, and the true states
 >>> runs.plot()                                      # medians and bands over the seeds of `run_many`
->>> plot_differences(found)                          # what `compare_arms` or `History.compare` found
+>>> draw_differences(found)                          # what `compare_arms` or `History.compare` found
 
 The functions need matplotlib and numpy alone. They return a figure, which a notebook shows; ``figure.savefig(path)``
 stores it.
@@ -132,7 +132,7 @@ def _true_values(name: str, truth: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 @matplotlib.style.context("mstfilter.app.report.figures")
-def plot_differences(found: Mapping[str, Any], label: str = "") -> Drawing:
+def draw_differences(found: Mapping[str, Any], label: str = "") -> Drawing:
     """Mean differences with their 95 % intervals, one row for each compared method; claims are filled points.
 
     `found` is the result of `mstfilter.scoring.compare_arms` or `History.compare`, and `label` what differs.

@@ -34,7 +34,7 @@ from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.inputs import AtStep
 from mstfilter.smc.interfaces import Proposal, Transition, Update
 from mstfilter.smc.models.distributions import MultivariateNormal
-from mstfilter.smc.models.simulation import simulated
+from mstfilter.smc.models.simulation import simulate_steps
 from mstfilter.smc.models.state_space import StateSpaceModel
 from mstfilter.smc.population import Particles, Population, union
 
@@ -236,7 +236,7 @@ class ConditionallyLinear(AtStep):
                 z = rng.multivariate_normal(F @ x["z"][0] + np.broadcast_to(given.b, (2, len(mean)))[0], Q)
             return {"u": regimes, "z": np.stack([z, z])}, rng.multivariate_normal(H @ z, R)
 
-        return simulated(step, n_steps, seed, inputs)
+        return simulate_steps(step, n_steps, seed, inputs)
 
 
 @dataclass(frozen=True)

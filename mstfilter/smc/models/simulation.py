@@ -27,7 +27,7 @@ from mstfilter.smc.streams import Key
 Step = Callable[[np.random.Generator, int, Any, Particles | None], tuple[Particles, Any]]
 
 
-def simulated(step: Step, n_steps: int, seed: int, inputs: Iterable[Any] | None) -> tuple[Particles, Any]:
+def simulate_steps(step: Step, n_steps: int, seed: int, inputs: Iterable[Any] | None) -> tuple[Particles, Any]:
     """States and observations of a run of `step`, for the methods `simulate`.
 
     Two particles move, and the first is kept, because functions of a model that mix up particles and the entries of a

@@ -60,7 +60,7 @@ from mstfilter.smc.interfaces import (
     Trigger,
 )
 from mstfilter.smc.models.distributions import as_distribution
-from mstfilter.smc.models.simulation import first_row, simulated
+from mstfilter.smc.models.simulation import first_row, simulate_steps
 from mstfilter.smc.population import Particles, Population, count_particles, take
 from mstfilter.smc.resampling import Systematic
 
@@ -165,7 +165,7 @@ class StateSpaceModel(AtStep):
             x = at.sample_initial(rng, 2) if x is None else at.sample_transition(rng, x)
             return x, first_row(at.sample_observation(rng, x))
 
-        return simulated(step, n_steps, seed, inputs)
+        return simulate_steps(step, n_steps, seed, inputs)
 
     def density(self, which: str) -> Callable[..., np.ndarray]:
         """The function ``log_initial`` or ``log_transition``.

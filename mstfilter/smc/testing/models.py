@@ -281,8 +281,9 @@ def simulated(filter: ParticleFilter, n_steps: int, seed: int = 0) -> list[Any]:
     try:
         return [y.item() if np.ndim(y) == 0 else y for y in model.simulate(n_steps, seed)[1]]
     except Exception as error:
+        what = error.message if isinstance(error, InputError) else f"the model cannot be simulated ({error})"
         hint = "give observations (mstfilter check ./model.py:model --observations ./model.py:ys)"
-        raise InputError(f"the model cannot be simulated: {hint}; {error}") from error
+        raise InputError(f"{what}: {hint}") from error
 
 
 def _groups(particles: Particles) -> list[Few]:

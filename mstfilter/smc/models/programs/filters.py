@@ -26,7 +26,7 @@ from mstfilter.smc.models.programs.handlers import (
     SiteHandler,
 )
 from mstfilter.smc.models.programs.sites import ProgramRun, active_run
-from mstfilter.smc.models.simulation import simulated
+from mstfilter.smc.models.simulation import simulate_steps
 from mstfilter.smc.population import Particles, Population
 
 Model = Callable[..., Any]
@@ -76,7 +76,7 @@ class Program:
                 run = run_once(model, handler, previous, asked, 2)
             return {**run.values, **run.returned}, _observation(handler.observed, asked)
 
-        return simulated(step, n_steps, seed, inputs)
+        return simulate_steps(step, n_steps, seed, inputs)
 
     def _filter(self, guide: Model | None, n: int, components: dict[str, Any]) -> ParticleFilter:
         initial, transition = ProgramInitial(self.model, guide), ProgramTransition(self.model, guide)
