@@ -55,7 +55,7 @@ def test_data_summaries_parameters_and_comparisons():
         "print(runs.compare('Systematic', x=kalman_filter(*m, ys).means))\n"
         "def filter_of(theta):\n"
         "    move = lambda x: Normal(theta['rho'] * x, 0.5)\n"
-        "    return bootstrap(StateSpaceModel.of(Normal(), move, lambda x: Poisson(2.0)), 10)\n"
+        "    return bootstrap(StateSpaceModel.of(Normal(), move, lambda x: Poisson(1.0 + x * x)), 10)\n"
         "prior = {'rho': Truncated(Normal(), -1.0, 1.0)}\n"
         "print(pmmh(filter_of, [1, 2], prior, scale=0.1, n_iterations=2)['rho'].shape)"
     )
