@@ -23,6 +23,7 @@ METHODS = {
     "exact": ({}, "ON2"),
     "mcmc": ({"method": "mcmc"}, "mcmc"),
     "mcmc, 3 steps": ({"method": "mcmc", "steps": 3}, None),
+    "rejection": ({"method": "rejection", "log_bound": -float(np.log(SIGMA * np.sqrt(2 * np.pi)))}, "reject"),
 }
 
 

@@ -33,6 +33,7 @@ from mstfilter.smc.history import (
     variance as variance,
     weights as weights,
 )
+from mstfilter.smc.inference.additive import additive as additive
 from mstfilter.smc.inference.conditional import conditional_path as conditional_path, path_log_prob as path_log_prob
 from mstfilter.smc.inference.diagnostics import (
     RunVariance as RunVariance,
@@ -46,6 +47,8 @@ from mstfilter.smc.inference.parameters import (
     particle_gibbs as particle_gibbs,
     pmmh as pmmh,
 )
+from mstfilter.smc.inference.samplers import Sampled as Sampled, ibis as ibis, tempering as tempering
+from mstfilter.smc.inference.smc2 import smc2 as smc2
 from mstfilter.smc.inference.smoothing import (
     Record as Record,
     backward_paths as backward_paths,
@@ -53,6 +56,7 @@ from mstfilter.smc.inference.smoothing import (
     genealogy as genealogy,
     keep as keep,
 )
+from mstfilter.smc.inference.two_filter import two_filter as two_filter
 from mstfilter.smc.inputs import WithInput as WithInput
 from mstfilter.smc.interfaces import (
     Codec as Codec,
@@ -78,6 +82,7 @@ from mstfilter.smc.models.combined import Mixture as Mixture, Product as Product
 from mstfilter.smc.models.distributions import (
     Bernoulli as Bernoulli,
     Categorical as Categorical,
+    Joint as Joint,
     MultivariateNormal as MultivariateNormal,
     Normal as Normal,
     Student as Student,
@@ -110,6 +115,7 @@ from mstfilter.smc.models.gaussian import (
 )
 from mstfilter.smc.models.programs.filters import Program as Program
 from mstfilter.smc.models.programs.sites import observe as observe, sample as sample, switch as switch
+from mstfilter.smc.models.quasi import SobolGenerator as SobolGenerator, sqmc as sqmc
 from mstfilter.smc.models.state_space import (
     Dynamics as Dynamics,
     Prior as Prior,

@@ -336,14 +336,16 @@ class _Step:
             with self.slot("initial"):
                 return self.call("initial", "sample", self.y, self.filter.n, n=self.filter.n)
         stayed = {"previous": identity(len(past))}
-        population = past.realised().labelled(stayed)
+        population = past.realised()
         if self.filter.transition is None:
-            return population
+            return population.labelled(stayed)
+        given = stayed | {"ancestor": past.parents["ancestor"]} if "ancestor" in past.parents else stayed
         with self.slot("transition"):
-            moved = self.call("transition", "predict", population, self.y)
-        if "previous" in moved.parents or len(moved) != len(population):
-            return moved
-        return moved.labelled({**moved.parents, **stayed}, moved.notes)
+            moved = self.call("transition", "predict", population.labelled(given), self.y)
+        parents = {name: index for name, index in moved.parents.items() if name != "ancestor"}
+        if len(moved) == len(population):
+            parents.setdefault("previous", stayed["previous"])
+        return moved.labelled(parents, moved.notes)
 
     def propose(self) -> Population | None:
         """Particles drawn from the observation; None if the observation is missing."""

@@ -95,7 +95,10 @@ class Transition(Component):
 
     @abstractmethod
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
-        """Move all particles. A missing `observation` is None."""
+        """Move all particles. A missing `observation` is None.
+
+        ``population.parents`` has "ancestor" if the particles have just been resampled.
+        """
 
 
 class DensityTransition(Transition):

@@ -300,3 +300,27 @@ def independent_draws_of_runs(rng: np.random.Generator, weights: np.ndarray) -> 
     index = np.searchsorted((cumulative + offsets).ravel(), (points + offsets).ravel(), side="right")
     index = index.reshape(runs, n) - n * offsets
     return np.clip(index, 0, (cumulative < 1).sum(axis=1, keepdims=True))
+
+
+def advance_runs(
+    filter: ParticleFilter,
+    filter_of: Callable[[np.ndarray], ParticleFilter],
+    population: Population | None,
+    n_runs: int,
+    t: int,
+    observation: Any,
+    key: Key,
+) -> tuple[np.ndarray, Population | None, np.ndarray]:
+    """One step of many runs, from the particles of all runs (None before the first step).
+
+    Returns the runs that are not lost, their particles, and the log mean weight of each of them.
+    """
+    sweep = _Sweep(filter, filter_of, list(range(n_runs)), key, {})
+    if population is not None:
+        sweep.population = population
+        sweep.ess, sweep.log_mean = summaries(population.log_weights.reshape(n_runs, -1))
+    try:
+        sweep.step(t, *split_input(observation))
+    except LostRunError:  # all weights of all runs are zero
+        sweep.runs = sweep.runs[:0]
+    return sweep.runs, sweep.population, sweep.log_mean

@@ -28,7 +28,13 @@ def test_benchmark_of_the_filter(tmp_path):
 def test_smoothing(tmp_path):
     run_script("benchmarks/smoothing.py", "--smoke", "--out", tmp_path / "smoothing.csv")
     methods = [row["method"] for row in read_csv(tmp_path / "smoothing.csv")]
-    assert methods == ["exact", "mcmc", "mcmc, 3 steps", "genealogy"]
+    assert methods == ["exact", "mcmc", "mcmc, 3 steps", "rejection", "genealogy"]
+
+
+def test_samplers(tmp_path):
+    run_script("benchmarks/samplers.py", "--smoke", "--out", tmp_path / "samplers.csv")
+    tasks = [row["task"] for row in read_csv(tmp_path / "samplers.csv")]
+    assert len(tasks) == 9 and tasks[-1] == "SMC^2, batched"
 
 
 def test_calibration_of_the_partition_update(tmp_path):

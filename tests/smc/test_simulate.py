@@ -162,6 +162,14 @@ def test_functions_of_objects_time_and_inputs():
     states, ys = several.simulate(3)
     assert states["x"].shape == (3,) and states["v"].shape == (3, 2) and states["x"][2] == states["x"][0] + 2.0
     assert [y["a"] for y in ys] == states["x"].tolist() and ys[1]["b"].shape == (2,)
+    named = StateSpaceModel.of(
+        {"x": Normal(0.0, 1.0), "v": Normal(0.0, 0.1)},
+        lambda p: {"x": Normal(p["x"] + p["v"], 0.1), "v": Normal(p["v"], 0.1)},
+        lambda p: {"gps": Normal(p["x"], 1.0), "speed": Normal(p["v"], 1.0)},
+    )
+    states, ys = named.simulate(4)
+    assert set(states) == {"x", "v"} and set(ys[0]) == {"gps", "speed"}
+    assert bootstrap(named, 50).run(ys)[0].population.mean().keys() == {"x", "v"}
     with pytest.raises(InputError, match="there are 2 inputs for 3 steps"):
         model.simulate(3, inputs="ab")
     with pytest.raises(InputError, match="n_steps is 0"):

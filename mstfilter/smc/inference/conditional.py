@@ -21,7 +21,7 @@ from mstfilter.base.errors import InputError, LostRunError, check_integer
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.inputs import check_observations, same_component, split_input
 from mstfilter.smc.interfaces import DensityTransition, Transition
-from mstfilter.smc.models.programs.filters import ProgramInitial, ProgramTransition, run_program
+from mstfilter.smc.models.programs.filters import ProgramInitial, ProgramTransition, run_once, run_program
 from mstfilter.smc.models.programs.handlers import GivenHandler
 from mstfilter.smc.models.state_space import Dynamics, Prior
 from mstfilter.smc.population import Particles, Population, count_particles, take
@@ -181,8 +181,9 @@ def _given_to_program(component: Any, old: Particles | None, given: Particles, y
     if component.guide is None or y is None:
         particle, gain = run_program(component.model, GivenHandler(given, weigh=False), old, y, 1)
         return particle, gain[0]
-    _, log_q = run_program(component.guide, GivenHandler(given), old, y, 1)
-    particle, log_p = run_program(component.model, GivenHandler(given), old, y, 1)
+    guide = GivenHandler(given)
+    log_q = run_once(component.guide, guide, old, y, 1).gain
+    particle, log_p = run_program(component.model, GivenHandler(given, weigh=guide.reached), old, y, 1)
     return particle, log_p[0] - log_q[0]
 
 

@@ -27,7 +27,7 @@ import numpy as np
 
 from mstfilter.base.errors import InputError, check_integer, naming
 from mstfilter.smc.filter import ParticleFilter
-from mstfilter.smc.interfaces import State
+from mstfilter.smc.interfaces import Infos, State
 from mstfilter.smc.population import Population, as_matrix, union
 from mstfilter.smc.wrapped_resampling import Coalesced, ResamplerWrapper
 
@@ -86,6 +86,7 @@ class RunVariance:
     mean: np.ndarray  #: (T, ...) weighted means of the function
     mean_variance: np.ndarray  #: (T, ...) variances of these means over seeds, entry by entry
     state: State  #: the last state of the run
+    infos: Infos = field(default_factory=Infos)  #: of its steps
 
 
 def run_variance(
@@ -94,6 +95,7 @@ def run_variance(
     seed: int = 0,
     lag: int | None = None,
     function: Callable[[Any], np.ndarray] | None = None,
+    until: Callable[[State], bool] | None = None,
 ) -> RunVariance:
     """Run a filter, and estimate the variances of its estimates from the ancestors of the particles.
 
@@ -130,6 +132,8 @@ def run_variance(
     function : callable, optional
         ``(particles) -> (n, ...)``: the values that are averaged. By default, array particles are averaged, and
         particles of another type give means of shape (T, 0).
+    until : callable, optional
+        ``(state) -> bool``: the run ends after the first state for which it is true.
 
     Returns
     -------
@@ -152,7 +156,7 @@ def run_variance(
     watched = _Watched(filter.resampler)
     ancestry = _Ancestry(lag)
     rows: list[tuple[Any, ...]] = []
-    state = filter.start(seed)
+    state, infos = filter.start(seed), Infos()
     for state, info in replace(filter, resampler=watched).iterate(observations, seed):
         population, total = state.population, state.log_evidence
         assert population is not None and total is not None
@@ -168,8 +172,11 @@ def run_variance(
         values = _values(population, function)
         mean = np.tensordot(population.weights, values, axes=1)
         rows.append((total, ancestry.evidence(), mean, ancestry.mean(values - mean)))
+        infos.append(info)
+        if until is not None and until(state):
+            break
     columns = [np.array(column) for column in zip(*rows, strict=True)] or [np.zeros(0)] * 4
-    return RunVariance(columns[0], columns[1], columns[2], columns[3], state)
+    return RunVariance(columns[0], columns[1], columns[2], columns[3], state, infos)
 
 
 def _values(population: Population, function: Callable[[Any], np.ndarray] | None) -> np.ndarray:

@@ -41,8 +41,7 @@ from mstfilter.smc.inference.conditional import conditional_path
 from mstfilter.smc.inference.metropolis import metropolis
 from mstfilter.smc.inputs import check_observations, split_input
 from mstfilter.smc.interfaces import Distribution
-from mstfilter.smc.models.combined import Product
-from mstfilter.smc.models.distributions import as_distribution
+from mstfilter.smc.models.distributions import Joint, as_distribution
 from mstfilter.smc.population import Particles, union
 from mstfilter.smc.streams import Key
 from mstfilter.smc.summaries import data_frame, flat_columns, inference_data
@@ -127,13 +126,10 @@ class _Parameters:
     def __init__(self, prior: Any, start: Any) -> None:
         self.names: tuple[str, ...] = ()
         self.prior: Distribution | None = None
-        if isinstance(prior, Mapping):
-            prior = Product(prior)
-        elif not callable(prior) and not isinstance(prior, Distribution):
-            prior = as_distribution(prior)
-        if isinstance(prior, Distribution):
-            self.prior, self.names = prior, getattr(prior, "names", ())
-            prior = prior.log_prob
+        if not callable(prior):
+            self.prior = as_distribution(prior)
+            self.names = tuple(self.prior.parts) if isinstance(self.prior, Joint) else ()
+            prior = self.prior.log_prob
         if isinstance(start, Mapping) and self.prior is None:
             self.names = tuple(map(str, start))
         self.function = prior
@@ -312,7 +308,7 @@ def pmmh(
         raise InputError(f"start has shape {theta.shape}, expected (d,) or (chains, d)")
     if scale is None:
         raise InputError("scale is missing", "give the standard deviation of a step for each parameter")
-    root = _step_root(parameters.vector("scale", scale), theta.shape[1])
+    root = step_root(parameters.vector("scale", scale), theta.shape[1])
     check_integer("n_iterations", n_iterations)
     posterior = _Posterior(filter_of, list(check_observations(observations)), parameters, batched)
 
@@ -366,7 +362,7 @@ def _numbers(name: str, value: Any) -> np.ndarray:
     return numbers
 
 
-def _step_root(scale: Any, d: int) -> np.ndarray:
+def step_root(scale: Any, d: int) -> np.ndarray:
     """(d, d) square root of the covariance of a step, from standard deviations or a covariance."""
     scale = _numbers("scale", scale)
     if scale.ndim < 2 and scale.shape in ((), (1,), (d,)) and np.isfinite(scale).all() and (scale > 0).all():

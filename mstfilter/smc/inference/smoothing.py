@@ -13,13 +13,14 @@ x_{t+1} with probability proportional to w_i f(x_{t+1} | x_i).
 >>> means = [population.weights @ population.particles for population in paths]        # E[x_t | y_0 .. y_2]
 
 `genealogy`, `fixed_lag` and `backward_paths` take a `Record` of any properly weighted filter and return a tuple with
-one population per time. The page "Smoothing" of the documentation compares them. `conditional_path` draws single
-paths of models and of programs. Reference: Godsill, Doucet, West (2004).
+one population per time. The page "Smoothing" of the documentation compares them with `two_filter`, and with
+`additive`, which needs no record. `conditional_path` draws single paths of models and of programs. Reference:
+Godsill, Doucet, West (2004).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -27,13 +28,13 @@ import numpy as np
 
 from mstfilter.base.errors import InputError, check_choice, check_component, check_integer, naming
 from mstfilter.smc.filter import ParticleFilter
-from mstfilter.smc.inference.metropolis import moved
+from mstfilter.smc.inference.metropolis import metropolis
 from mstfilter.smc.inputs import check_observations, split_input
 from mstfilter.smc.interfaces import DensityTransition, State
-from mstfilter.smc.population import Particles, Population, take
+from mstfilter.smc.population import Particles, Population, count_particles, take
 from mstfilter.smc.resampling import draw_log, independent_draws
 
-BackwardMethod = Literal["exact", "mcmc"]
+BackwardMethod = Literal["exact", "mcmc", "rejection"]
 #: Largest number of pairs of particles in a call of `log_prob`.
 _PAIRS = 1_000_000
 
@@ -106,6 +107,7 @@ def backward_paths(
     method: BackwardMethod = "exact",
     *,
     steps: int = 1,
+    log_bound: float | None = None,
 ) -> tuple[Population, ...]:
     """Draw `n` equally weighted paths from the smoothing distribution. The rows k of all populations form a path.
 
@@ -115,44 +117,84 @@ def backward_paths(
     ----------
     transition : DensityTransition
         The transition of the model, ``Dynamics(model)``. A transition with a proposal must not be used.
-    method : "exact" or "mcmc"
+    method : "exact", "mcmc" or "rejection"
         "exact" (FFBSi: Godsill, Doucet, West 2004) evaluates n N densities per step: all N particles for each path.
 
         "mcmc" (Bunch and Godsill 2013) starts at the parent of x_{t+1} in the record and makes Metropolis steps that
         leave the distribution of "exact" invariant. The method evaluates (1 + `steps`) n densities per time, and the
         record must have parents. Few steps suffice (Dau and Chopin 2023): the parent of x_{t+1} has the distribution
         of "exact" up to an error of order 1 / N. Without accepted steps, the paths are those of `genealogy`.
+
+        "rejection" (Douc, Garivier, Moulines, Olsson 2011) has the law of "exact", and needs `log_bound`. It draws by
+        w_i and accepts with probability f / bound. Rows that are hardly ever accepted are drawn as by "exact" (Dau
+        and Chopin 2023).
     steps : int
         Number of Metropolis steps of "mcmc".
+    log_bound : float, optional
+        Upper bound of log f, for "rejection": -log(sd sqrt(2 pi)) for Gaussian noise.
     """
     check_integer("n", n)
-    check_component("transition", transition, DensityTransition)
-    check_choice("method", method, get_args(BackwardMethod))
-    check_integer("steps", steps)
+    kernel = Backward(transition, method, steps, log_bound)
     last = record.populations[-1].realised()
     index = _by_weight(rng, last, n)
     path = [Population(take(last.particles, index))]
     for t in range(len(record) - 2, -1, -1):
         population = record.populations[t].realised()
-        y, u = split_input(record.observations[t + 1])
-        step = record.first + t
-        move = _Move(population, path[-1].particles, transition.at_step(step + 1, u), y, step)
-        index = move.metropolis(rng, record.parents(t + 1)[index], steps) if method == "mcmc" else move.exact(rng, n)
+        move = kernel.moves(population, path[-1].particles, record.observations[t + 1], record.first + t)
+        index = move.draw(rng, record.parents(t + 1)[index] if method == "mcmc" else None)[0]
         path.append(Population(take(population.particles, index)))
     return tuple(reversed(path))
 
 
 @dataclass(frozen=True)
-class _Move:
+class Backward:
+    """The backward kernel, as the arguments of `backward_paths` define it."""
+
+    transition: DensityTransition
+    method: BackwardMethod = "exact"
+    steps: int = 1
+    log_bound: float | None = None
+
+    def __post_init__(self) -> None:
+        check_component("transition", self.transition, DensityTransition)
+        check_choice("method", self.method, get_args(BackwardMethod))
+        check_integer("steps", self.steps)
+        if self.method == "rejection" and self.log_bound is None:
+            raise InputError(
+                "the method rejection needs log_bound, an upper bound of the log density of the transition"
+            )
+
+    def moves(self, population: Population, later: Particles, observation: Any, t: int) -> Moves:
+        """The possible moves from a population at time t to particles at time t + 1, which saw `observation`."""
+        y, u = split_input(observation)
+        return Moves(self, population, later, self.transition.at_step(t + 1, u), y, t)
+
+
+@dataclass(frozen=True)
+class Moves:
     """The possible moves from a population at time t to n particles at time t + 1."""
 
+    kernel: Backward
     population: Population
     later: Particles
     transition: DensityTransition
     y: Any
     t: int
 
-    def _log_density(self, index: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+    def __len__(self) -> int:
+        return count_particles(self.later)
+
+    def draw(self, rng: np.random.Generator, parents: np.ndarray | None, draws: int = 1) -> np.ndarray:
+        """(draws, n) indices of predecessors at time t. "mcmc" starts at the `parents` (n,)."""
+        n = len(self)
+        if self.kernel.method == "exact":
+            return np.concatenate([self._by_log(rng, log_w, draws) for _, log_w in self.blocks(np.arange(n))], axis=1)
+        if self.kernel.method == "rejection":
+            return self._rejection(rng, np.tile(np.arange(n), draws)).reshape(draws, n)
+        assert parents is not None
+        return self._metropolis(rng, parents, draws)
+
+    def log_density(self, index: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
         """(k,) log density of the moves from particles `index` to the later particles `rows` (default: all)."""
         later = self.later if rows is None else take(self.later, rows)
         found = self.transition.log_prob(take(self.population.particles, index), later, self.y)
@@ -163,30 +205,56 @@ class _Move:
             raise _impossible(self.t)
         return density
 
-    def exact(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """(n,) indices of predecessors at time t, drawn from the exact distribution."""
-        m, drawn = len(self.population), []
-        for rows in np.split(np.arange(n), range(max(1, _PAIRS // m), n, max(1, _PAIRS // m))):
-            density = self._log_density(np.tile(np.arange(m), len(rows)), np.repeat(rows, m))
-            log_weights = self.population.log_weights + density.reshape(-1, m)
-            if (log_weights.max(axis=1) == -np.inf).any():
-                raise _impossible(self.t)
-            drawn.append(draw_log(rng, log_weights))
-        return np.concatenate(drawn)
+    def blocks(self, rows: np.ndarray, strict: bool = True) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Some of the later particles at a time, with the log weights (k, m) of their predecessors.
 
-    def metropolis(self, rng: np.random.Generator, parents: np.ndarray, steps: int) -> np.ndarray:
-        """(n,) indices of predecessors after Metropolis steps that start at the parents."""
-        density = self._log_density(parents)
+        If `strict`, raises InputError if all are impossible.
+        """
+        m, size = len(self.population), max(1, _PAIRS // len(self.population))
+        for some in np.split(rows, range(size, len(rows), size)):
+            density = self.log_density(np.tile(np.arange(m), len(some)), np.repeat(some, m))
+            log_weights = density.reshape(-1, m)
+            log_weights += self.population.log_weights
+            if strict and (log_weights.max(axis=1) == -np.inf).any():
+                raise _impossible(self.t)
+            yield some, log_weights
+
+    def _by_log(self, rng: np.random.Generator, log_weights: np.ndarray, draws: int) -> np.ndarray:
+        return np.stack([draw_log(rng, log_weights) for _ in range(draws)])
+
+    def _rejection(self, rng: np.random.Generator, rows: np.ndarray) -> np.ndarray:
+        """(k,) indices of predecessors of the later particles `rows`."""
+        index, left, bound = np.empty(len(rows), np.int64), np.arange(len(rows)), self.kernel.log_bound
+        assert bound is not None
+        while len(left):
+            proposed = _by_weight(rng, self.population, len(left))
+            density = self.log_density(proposed, rows[left])
+            if (density > bound + 1e-9).any():
+                raise InputError(f"log_bound is {bound}, and a log density from step {self.t} is {density.max()}")
+            accepted = np.log1p(-rng.random(len(left))) < density - bound
+            index[left[accepted]] = proposed[accepted]
+            left, share = left[~accepted], np.mean(accepted)
+            if share < 20 / len(self.population):  # the exact draw takes less time than the expected trials
+                break
+        if len(left):
+            rest = [draw_log(rng, log_weights) for _, log_weights in self.blocks(rows[left])]
+            index[left] = np.concatenate(rest)
+        return index
+
+    def _metropolis(self, rng: np.random.Generator, parents: np.ndarray, draws: int) -> np.ndarray:
+        """States of chains that start at the parents, after every `steps` Metropolis steps."""
+        density = self.log_density(parents)
         if not (density > -np.inf).all():
             raise _impossible(self.t)
 
         def propose(rng: np.random.Generator, now: dict[str, Any]) -> tuple[dict[str, Any], np.ndarray]:
             index = _by_weight(rng, self.population, len(parents))
-            density = self._log_density(index)
+            density = self.log_density(index)
             return {"index": index, "density": density}, density - now["density"]
 
-        last, _ = moved(rng, {"index": parents, "density": density}, propose, steps)
-        return last["index"]
+        steps = self.kernel.steps
+        chain = metropolis(rng, {"index": parents, "density": density}, propose, steps * draws)
+        return np.stack([state["index"] for k, (state, _) in enumerate(chain, 1) if k % steps == 0])
 
 
 def _by_weight(rng: np.random.Generator, population: Population, n: int) -> np.ndarray:

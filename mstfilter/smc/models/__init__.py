@@ -8,6 +8,7 @@
 `combined`       mixtures, truncated distributions, products of independent ones
 `exact`          linear-Gaussian and finite models, whose posterior is known
 `gaussian`       models with Gaussian noise: UKF proposals, Rao-Blackwellised filters
+`quasi`          Sobol points in place of random numbers (SQMC)
 
 All public names are imported from `mstfilter.smc`.
 """

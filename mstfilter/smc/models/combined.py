@@ -1,12 +1,12 @@
 """Distributions made of others: mixtures, truncated ones, and products of independent ones.
 
 >>> import numpy as np
->>> from mstfilter.smc import Gamma, Mixture, Normal, Product, Truncated, Uniform
+>>> from mstfilter.smc import Gamma, Mixture, Normal, Product, Truncated
 >>> heavy = Mixture([0.95, 0.05], [Normal(0.0, 1.0), Normal(0.0, 10.0)])        # one reading in twenty is an outlier
 >>> positive = Truncated(Normal(0.0, 1.0), low=0.0)
->>> prior = Product({"rho": Uniform(-1.0, 1.0), "sigma": Gamma(2.0, 0.5)})      # as `pmmh` takes it
->>> sorted(prior.sample(np.random.default_rng(0), 3)), round(float(prior.log_prob({"rho": 0.5, "sigma": 1.0})), 3)
-(['rho', 'sigma'], -1.307)
+>>> vectors = Product([Normal(0.0, 1.0), Gamma(2.0, 0.5)])                      # of two independent entries
+>>> vectors.sample(np.random.default_rng(0), 3).shape, round(float(vectors.log_prob([0.5, 1.0])), 3)
+((3, 2), -1.658)
 
 The parts are distributions of this package or frozen ones of scipy.stats. Their parameters may have one row per
 particle, as may the weights of a mixture and the bounds of a truncated distribution.
@@ -14,7 +14,7 @@ particle, as may the weights of a mixture and the bounds of a truncated distribu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any
@@ -204,63 +204,41 @@ class Truncated(Distribution):
 
 @dataclass(frozen=True, eq=False)
 class Product(Distribution):
-    """Independent values of several distributions, as named variables or as the entries of a vector.
-
-    Given a mapping from names to distributions, values are mappings from these names to arrays. Given a sequence of d
-    distributions of numbers, values are (n, d).
-    """
+    """Vectors (n, d) whose d entries are independent. Named variables are a `Joint`."""
 
     parts: Any
 
     def __post_init__(self) -> None:
-        named = isinstance(self.parts, Mapping)
-        given = dict(self.parts) if named else dict(enumerate(self.parts))
-        parts = {name: as_distribution(part) for name, part in given.items()}
-        if not parts or (not named and any(part.event_shape for part in parts.values())):
+        parts = tuple(map(as_distribution, self.parts))
+        if not parts or any(part.event_shape for part in parts):
             raise InputError(
-                f"the parts of a Product have event shapes {[part.event_shape for part in parts.values()]}, expected "
-                "one or more distributions of numbers",
-                "give vectors a name: Product({'x': ..., 'v': ...})",
+                f"the parts of a Product have event shapes {[part.event_shape for part in parts]}, expected one or "
+                "more distributions of numbers",
+                "give vectors a name: Joint({'x': ..., 'v': ...})",
             )
-        object.__setattr__(self, "parts", parts if named else tuple(parts.values()))
-        object.__setattr__(self, "_by_key", parts)
-        object.__setattr__(self, "discrete", all(part.discrete for part in parts.values()))
-        object.__setattr__(self, "draws_numbers", all(part.draws_numbers for part in parts.values()))
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the variables; () if the values are vectors."""
-        return tuple(self.parts) if isinstance(self.parts, Mapping) else ()
+        object.__setattr__(self, "parts", parts)
+        object.__setattr__(self, "discrete", all(part.discrete for part in parts))
+        object.__setattr__(self, "draws_numbers", all(part.draws_numbers for part in parts))
 
     @property
     def parameter_shape(self) -> tuple[int, ...]:
-        if self.names:
-            raise InputError("the values of a Product of named variables are mappings, which have no shape")
         return (
             *(_broadcast_shape(*(np.empty(part.parameter_shape) for part in self.parts)) or (1,)),
             len(self.parts),
         )
 
     def check_parameters(self) -> None:
-        for part in self.__dict__["_by_key"].values():
+        for part in self.parts:
             part.check_parameters()
 
-    def sample(self, rng: np.random.Generator, size: int) -> Any:
-        drawn = {key: part.sample(rng, size) for key, part in self.__dict__["_by_key"].items()}
-        return drawn if self.names else np.stack(list(drawn.values()), axis=-1)
+    def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
+        return np.stack([part.sample(rng, size) for part in self.parts], axis=-1)
 
     def log_prob(self, value: Any) -> np.ndarray:
-        if self.names and (not isinstance(value, Mapping) or value.keys() != self.parts.keys()):
-            found = list(value) if isinstance(value, Mapping) else type(value).__name__
-            raise InputError(f"the variables of a Product are {list(self.names)}, found {found}")
-        values = value if self.names else dict(enumerate(np.moveaxis(np.asarray(value), -1, 0)))
-        return sum(part.log_prob(values[key]) for key, part in self.__dict__["_by_key"].items())
+        entries = np.moveaxis(np.asarray(value), -1, 0)
+        return sum(part.log_prob(entry) for part, entry in zip(self.parts, entries, strict=True))
 
     @property
-    def mean(self) -> Any:
-        """Means: a mapping, or vectors of the shape of the parameters."""
-        means = {key: part.mean for key, part in self.__dict__["_by_key"].items()}
-        if self.names:
-            return means
+    def mean(self) -> np.ndarray:
         rows = self.parameter_shape[:1]
-        return np.stack([np.broadcast_to(mean, rows) for mean in means.values()], axis=-1)
+        return np.stack([np.broadcast_to(part.mean, rows) for part in self.parts], axis=-1)

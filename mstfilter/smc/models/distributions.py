@@ -26,7 +26,7 @@ their place (`as_distribution`), but are slower. For a distribution of another l
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -443,10 +443,67 @@ class Categorical(Distribution):
         return self.probs @ np.arange(self.probs.shape[-1], dtype=np.float64)
 
 
+@dataclass(frozen=True, eq=False)
+class Joint(Distribution):
+    """Several named variables, drawn in the order of the mapping `parts`; values are mappings of arrays.
+
+    A part is a distribution, or a function of the variables before it that returns one: ``{"k": Categorical(p), "x":
+    lambda drawn: Normal(mean[drawn["k"]], 1.0)}``. A value None, of an observation that is missing, adds nothing to
+    the log density.
+    """
+
+    parts: Mapping[str, Any]
+
+    def _chain(self, value: Callable[[str, Distribution], Any]) -> Iterator[tuple[str, Distribution, Any]]:
+        """Each variable with its distribution given those before it, and its value."""
+        found: dict[str, Any] = {}
+        for name, part in self.parts.items():
+            plain = isinstance(part, Distribution) or hasattr(part, "rvs") or not callable(part)
+            distribution = as_distribution(part if plain else part(found))
+            found[name] = value(name, distribution)
+            yield name, distribution, found[name]
+
+    def check_parameters(self) -> None:
+        for part in self.parts.values():
+            if isinstance(part, Distribution):
+                part.check_parameters()
+
+    def sample(self, rng: np.random.Generator, size: int) -> Any:
+        return {name: x for name, _, x in self._chain(lambda name, part: part.sample(rng, size))}
+
+    def log_prob(self, value: Any) -> np.ndarray:
+        if not isinstance(value, Mapping) or not value.keys() >= self.parts.keys():
+            found = sorted(value) if isinstance(value, Mapping) else f"a {type(value).__name__}"
+            raise InputError(f"the values have the variables {found}, expected {sorted(self.parts)}")
+        total: Any = 0.0
+        for name, part, x in self._chain(lambda name, part: value[name]):
+            if x is None:
+                continue
+            shape, event = np.shape(x), part.event_shape
+            if shape not in (event, (1, *event)) and shape[1:] != event:
+                raise InputError(f"variable {name!r} has shape {shape}, expected rows of shape {event}")
+            total = total + part.log_prob(x)
+        return np.asarray(total, np.float64)
+
+    @property
+    def parameter_shape(self) -> tuple[int, ...]:
+        raise InputError("the values of a Joint are mappings, which have no shape")
+
+    @property
+    def mean(self) -> Any:
+        """Means by name: of a part that depends on others, at the means of these."""
+        return {name: m for name, _, m in self._chain(lambda name, part: part.mean)}
+
+
 def as_distribution(value: Any) -> Distribution:
-    """Return a `Distribution`, or convert a frozen distribution of scipy.stats. Raises InputError for other types."""
+    """The distribution that a value describes: itself, one of scipy.stats, or a mapping of names (`Joint`).
+
+    Raises InputError for other types.
+    """
     if isinstance(value, Distribution):
         return value
+    if isinstance(value, Mapping):
+        return Joint(value)
     if type(value).__module__.startswith("scipy.stats") and hasattr(value, "rvs"):
         return FromScipy(value)
     raise InputError(

@@ -26,7 +26,7 @@ Papaspiliopoulos (2020), chapter 10.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -59,7 +59,7 @@ from mstfilter.smc.interfaces import (
     Resampler,
     Trigger,
 )
-from mstfilter.smc.models.distributions import as_distribution
+from mstfilter.smc.models.distributions import Joint, as_distribution
 from mstfilter.smc.models.simulation import first_row, simulate_steps
 from mstfilter.smc.population import Particles, Population, count_particles, take
 from mstfilter.smc.resampling import Systematic
@@ -112,6 +112,9 @@ class StateSpaceModel(AtStep):
         `initial` is the distribution of x_0. ``transition(particles)`` and ``observation(particles)`` return the
         distributions of x_t and y_t, with one row per particle. The functions may also have the parameters ``t`` and
         ``u``.
+
+        A mapping from names to distributions stands for several variables, drawn in its order. A function of the
+        variables drawn so far can replace a distribution (`Joint`). Particles, or observations, are then mappings.
         """
         first = as_distribution(initial)
         for name, function in (("transition", transition), ("observation", observation)):
@@ -203,25 +206,35 @@ class _Densities(AtStep):
         return as_distribution(self.observation(x)).sample(rng, count_particles(x))
 
 
-def _of_shape(what: str, new: np.ndarray, old: Any) -> np.ndarray:
+def _of_shape(what: str, new: Any, old: Any) -> Any:
     """The new particles. Raises InputError if their shape differs, because numpy might broadcast them."""
-    if isinstance(old, np.ndarray) and np.shape(new) != old.shape:
+    found, expected = _shape(new), _shape(old)
+    if expected is not None and found != expected:
         raise InputError(
-            f"the {what} returned shape {np.shape(new)}, expected {old.shape} as the particles before",
+            f"the {what} returned shape {found}, expected {expected} as the particles before",
             "x[:, None] makes (n, 1) of (n,)",
         )
     return new
 
 
+def _shape(particles: Any) -> Any:
+    """The shape of an array, or the shapes of a mapping by name; None for objects."""
+    if isinstance(particles, np.ndarray):
+        return particles.shape
+    return {name: np.shape(a) for name, a in particles.items()} if isinstance(particles, Mapping) else None
+
+
 def _log_state(distribution: Distribution, x: Any) -> np.ndarray:
     """(n,) log density of states. Checks the shape of the particles, which a proposal may have drawn."""
-    if np.shape(x)[1:] != distribution.event_shape:
+    if not isinstance(distribution, Joint) and np.shape(x)[1:] != distribution.event_shape:
         raise InputError(f"particles have shape {np.shape(x)}, expected the event shape {distribution.event_shape}")
     return distribution.log_prob(x)
 
 
 def _log_likelihood(distribution: Distribution, y: Any) -> np.ndarray:
     """(n,) log p(y | x). Checks the shape of y, because numpy would broadcast entries of y against particles."""
+    if isinstance(distribution, Joint):
+        return distribution.log_prob(y)
     found, event = () if isinstance(y, float) else np.shape(y), distribution.event_shape
     if found not in (event, (1, *event)) and (found, event) != ((), (1,)):
         raise InputError(

@@ -16,6 +16,6 @@ for each entry of a mapping that the function returns. `observe` adds log p(valu
 on its particles. For particles with different numbers of variables, use a `StateSpaceModel` of objects.
 
 The methods of `Program` make a bootstrap filter or a guided filter from the function. A guided filter needs a guide:
-a program that samples the same names. A run of the program moves and weights the particles. The program is therefore
-the transition of the filter, and the filter has no update.
+a program that samples the same names, or some of them. A run of the program moves and weights the particles. The
+program is therefore the transition of the filter, and the filter has no update.
 """

@@ -103,7 +103,7 @@ def _runs(
         else:
             proposed = GuideHandler(rng, n)
             run(guide, proposed, previous, observation, n)
-            run(model, ReplayHandler(proposed), previous, observation, n)
+            run(model, ReplayHandler(proposed, rng), previous, observation, n)
     return runs
 
 

@@ -51,8 +51,8 @@ class Program:
     def guided(self, guide: Model, n: int, **components: Any) -> ParticleFilter:
         """Guided filter, which draws from the guide and weights by the density ratio of model and guide.
 
-        The guide is a program that samples every name of the model, given the observation. If the observation is
-        missing, particles are drawn from the model.
+        The guide is a program that samples names of the model, given the observation. Names that it leaves out are
+        drawn from the model. If the observation is missing, all are.
         """
         return self._filter(guide, n, components)
 
@@ -162,8 +162,8 @@ def program_step(
     if guide is None:
         return run_program(model, SampleHandler(rng), previous, observation, n)
     proposed = GuideHandler(rng, n)
-    run_program(guide, proposed, previous, observation, n)
-    return run_program(model, ReplayHandler(proposed), previous, observation, n)
+    run_once(guide, proposed, previous, observation, n)
+    return run_program(model, ReplayHandler(proposed, rng), previous, observation, n)
 
 
 def run_program(

@@ -6,7 +6,7 @@ A handler draws a value, replays the draw of a guide, or takes a given value.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -77,12 +77,14 @@ class GuideHandler(SiteHandler):
     def __init__(self, rng: np.random.Generator, n: int) -> None:
         self.rng, self.n = rng, n
         self.values: dict[str, np.ndarray] = {}
-        self.log_q: dict[str, np.ndarray] = {}  #: NaN for particles that do not reach the site
+        self.log_q: dict[str, np.ndarray] = {}
+        self.reached: dict[str, np.ndarray] = {}  #: (n,) whether each particle reached the site
 
     def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
         value = site.distribution.sample(self.rng, site.size)
         log_q = self.log_q.setdefault(site.name, np.full(self.n, np.nan))
         log_q[site.index] = site.distribution.log_prob(value)
+        self.reached.setdefault(site.name, np.zeros(self.n, bool))[site.index] = True
         return value, None
 
     def finish(self, values: dict[str, np.ndarray]) -> None:
@@ -90,26 +92,25 @@ class GuideHandler(SiteHandler):
 
 
 class ReplayHandler(SiteHandler):
-    """Takes the values of a guide, and weights particles by f / q (density of the model / density of the guide)."""
+    """Takes the values of a guide, and weights particles by f / q (density of the model / density of the guide).
 
-    def __init__(self, guide: GuideHandler) -> None:
-        self.guide = guide
+    What the guide has not drawn, a site or some particles of it, is drawn from the model, where f / q is 1.
+    """
+
+    def __init__(self, guide: GuideHandler, rng: np.random.Generator) -> None:
+        self.guide, self.rng = guide, rng
 
     def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
-        if site.name not in self.guide.values:
-            raise InputError(
-                "the guide has no such site",
-                f'add sample("{site.name}", ...) to the guide; it has {sorted(self.guide.values)}',
-            )
+        reached = self.guide.reached.get(site.name, np.zeros(self.guide.n, bool))[site.index]
+        if not reached.any():
+            return site.distribution.sample(self.rng, site.size), None
         value, log_q = self.guide.values[site.name][site.index], self.guide.log_q[site.name][site.index]
         check_shape("the values of the guide", value, site.distribution, site.size)
-        missing = int(np.isnan(log_q).sum())
-        if missing:
-            raise InputError(
-                f"the guide does not draw it for {missing} of {site.size} particles",
-                "sample it in the same branches as in the model, or outside of the branches",
-            )
-        return value, site.distribution.log_prob(value) - log_q
+        if reached.all():
+            return value, site.distribution.log_prob(value) - log_q
+        rows = reached.reshape(-1, *(1,) * (value.ndim - 1))
+        value = np.where(rows, value, site.distribution.sample(self.rng, site.size))
+        return value, np.where(reached, site.distribution.log_prob(value) - log_q, 0.0)
 
     def finish(self, values: dict[str, np.ndarray]) -> None:
         unused = sorted(set(self.guide.values) - set(values))
@@ -138,20 +139,26 @@ class GivenHandler(SiteHandler):
         Given values by the name of the site.
     rows : (n,) int, optional
         The rows of `values` that belong to the n particles. By default, all rows are used.
-    weigh : bool
-        Whether the particles are weighted by the density of the values.
+    weigh : bool or collection of str
+        Whether the particles are weighted by the density of the values; or the names of the sites for which they are.
     """
 
     draws = False
 
-    def __init__(self, values: Mapping[str, np.ndarray], rows: np.ndarray | None = None, weigh: bool = True) -> None:
+    def __init__(
+        self, values: Mapping[str, np.ndarray], rows: np.ndarray | None = None, weigh: bool | Collection[str] = True
+    ) -> None:
         self.values, self.rows, self.weigh = values, rows, weigh
         self.names: set[str] = set()  #: of the sites that the program has sampled
+        self.reached: set[str] = set()  #: of those that some particle has reached
 
     def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
         if site.name not in self.values:
             raise InputError("there is no value for it")
         self.names.add(site.name)
+        if site.size:
+            self.reached.add(site.name)
         value = self.values[site.name][site.index if self.rows is None else self.rows[site.index]]
         check_shape("the values", value, site.distribution, site.size)
-        return value, site.distribution.log_prob(value) if self.weigh else None
+        weigh = self.weigh if isinstance(self.weigh, bool) else site.name in self.weigh
+        return value, site.distribution.log_prob(value) if weigh else None

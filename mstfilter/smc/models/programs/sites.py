@@ -12,7 +12,7 @@ import numpy as np
 from mstfilter.base.errors import InputError
 from mstfilter.smc.first_steps import made_runs
 from mstfilter.smc.interfaces import Distribution
-from mstfilter.smc.models.distributions import Categorical, as_distribution
+from mstfilter.smc.models.distributions import Categorical, Joint, as_distribution
 from mstfilter.smc.models.programs.handlers import Site, SiteHandler, check_shape
 from mstfilter.smc.population import frozen_view, take
 
@@ -138,6 +138,8 @@ class ProgramRun:
     def sample(self, name: str, distribution: Any) -> Any:
         self._last, self.inside = ("site", name, self._where), True
         rows, size, distribution = self._rows, self._size, as_distribution(distribution)
+        if isinstance(distribution, Joint):
+            raise InputError("a site has one variable", "call sample once for each variable, in order")
         self._check_name(name)
         value, gain = self.handler.value(Site(name, distribution, size, rows))
         value = frozen_view(np.asarray(value))
