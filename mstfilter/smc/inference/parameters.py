@@ -308,7 +308,7 @@ def pmmh(
         raise InputError(f"start has shape {theta.shape}, expected (d,) or (chains, d)")
     if scale is None:
         raise InputError("scale is missing", "give the standard deviation of a step for each parameter")
-    root = step_root(parameters.vector("scale", scale), theta.shape[1])
+    root = _step_root(parameters.vector("scale", scale), theta.shape[1])
     check_integer("n_iterations", n_iterations)
     posterior = _Posterior(filter_of, list(check_observations(observations)), parameters, batched)
 
@@ -362,7 +362,7 @@ def _numbers(name: str, value: Any) -> np.ndarray:
     return numbers
 
 
-def step_root(scale: Any, d: int) -> np.ndarray:
+def _step_root(scale: Any, d: int) -> np.ndarray:
     """(d, d) square root of the covariance of a step, from standard deviations or a covariance."""
     scale = _numbers("scale", scale)
     if scale.ndim < 2 and scale.shape in ((), (1,), (d,)) and np.isfinite(scale).all() and (scale > 0).all():

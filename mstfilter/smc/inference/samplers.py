@@ -46,7 +46,7 @@ from mstfilter.smc.components import Always, EssBelow
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.inference.diagnostics import RunVariance, run_variance
 from mstfilter.smc.inference.metropolis import metropolis
-from mstfilter.smc.inference.parameters import step_root
+from mstfilter.smc.inference.parameters import _step_root
 from mstfilter.smc.inputs import bind_step, check_observations, check_signature, split_input, step_parameters
 from mstfilter.smc.interfaces import Distribution, Proposal, Resampler, Size, State, Transition, Trigger, Update
 from mstfilter.smc.models.distributions import as_distribution
@@ -97,7 +97,7 @@ def tempering(
     waste_free: bool = True,
     scale: Any = None,
     resampler: Resampler = Systematic(),  # noqa: B008 (frozen)
-    lag: int | None = None,
+    lag: int | None = 5,
 ) -> Sampled:
     """Draw from a posterior by powers of the likelihood that increase from 0 to 1.
 
@@ -122,7 +122,8 @@ def tempering(
         Standard deviations or covariance of a step, with parameters in the order of the prior. By default,
         2.38^2 / d times the covariance of the particles (Roberts, Gelman, Gilks 1997).
     lag : int, optional
-        For the standard error, see `run_variance`.
+        Number of steps whose ancestors the standard errors use (`run_variance`): None for all, which has no bias from
+        the lag and more noise.
 
     Raises
     ------
@@ -320,7 +321,7 @@ class Sampler:
         filter = ParticleFilter(
             initial=_FromPrior(theta, self.target),
             transition=_Moves(theta, self.target, self.steps, self.waste_free),
-            update=_Extend(theta, self.target, None if self.scale is None else step_root(self.scale, d)),
+            update=_Extend(theta, self.target, None if self.scale is None else _step_root(self.scale, d)),
             resampler=resampler,
             trigger=self.trigger,
             n=self.n,

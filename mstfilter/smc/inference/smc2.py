@@ -42,14 +42,13 @@ from mstfilter.smc.resampling import Systematic
 from mstfilter.smc.streams import Key
 from mstfilter.smc.sweep import advance_runs, can_sweep
 
-FilterOf = Callable[[Any], ParticleFilter]
 #: Variables of a parameter vector: of a sweep, the log weights (n, m) and particles (n, m, ...) of m particles of its
 #: filter, where an array has the name `_X`; otherwise the filter with its state, as an object.
 _WEIGHTS, _X, _RUN = "log weights of the filter", "particle of the filter", "run of the filter"
 
 
 def smc2(
-    filter_of: FilterOf,
+    filter_of: Callable[[Any], ParticleFilter],
     observations: Iterable[Any],
     prior: Any,
     n: int = 500,
@@ -103,7 +102,7 @@ def smc2(
 class _Filters(Target):
     """The likelihood estimated by a filter for each parameter vector. `data` is a list of observations."""
 
-    filter_of: FilterOf
+    filter_of: Callable[[Any], ParticleFilter]
     grow_below: float
     most_particles: int
 
