@@ -15,7 +15,6 @@ from mstfilter.lab.simulation import recorder
 from mstfilter.lab.simulation.families import scene_family
 from mstfilter.lab.simulation.recorder import (
     SimulatedScene,
-    cache_folder,
     cached_recording,
     recipe_key,
     simulate_recording,
@@ -208,14 +207,6 @@ def test_a_recording_that_another_process_wrote_meanwhile_is_kept(tmp_path, monk
     assert cached_recording("s1", 3, tmp_path / "here", **TINY).name == expected
     assert sorted(p.name for p in (tmp_path / "here").iterdir()) == [".gitignore", expected]
     assert (tmp_path / "here" / expected / "manifest.json").read_text() == "{}"
-
-
-def test_default_folder(monkeypatch, tmp_path):
-    monkeypatch.setenv("MSTFILTER_CACHE", str(tmp_path / "a"))
-    assert cache_folder() == tmp_path / "a"
-    monkeypatch.delenv("MSTFILTER_CACHE")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "b"))
-    assert cache_folder() == tmp_path / "b" / "mstfilter"
 
 
 def test_invalid_arguments_of_the_cache(tmp_path):
