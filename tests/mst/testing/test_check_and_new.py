@@ -120,7 +120,7 @@ def test_check_names_what_is_broken(capsys):
     assert re.search(r"BiasedResidual: (1 property is|\d+ properties are) broken", out)
 
 
-def test_check_of_registered_components_with_fields(capsys):
+def test_check_of_registered_components_with_fields(capsys, fewer_calls):
     given = ("check", "resampler.tempered", "power=0.25", "scheme=ssp", "--budget", "3600")
     code, out, _ = call(*given, capsys=capsys)
     assert code == 0

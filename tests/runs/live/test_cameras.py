@@ -17,7 +17,7 @@ from mstfilter.scene import Recording, project
 from tests.conftest import REPOSITORY
 from tests.formats.bags import COLOUR, DEPTH, scene_messages, topic_info
 from tests.formats.layouts import FPS, SHIFTS, units, video
-from tests.runs.live.test_stream import FAST, RULE, arrays
+from tests.runs.live.test_stream import FAST, QUICK, RULE, arrays
 from tests.scene.scenes import CAMERA
 
 EXAMPLES = REPOSITORY / "docs" / "examples" / "live"
@@ -95,7 +95,7 @@ def results(monkeypatch):
     def stream(K, name, on_pause):
         assert name == "mst"
         both = lambda pause: (found.append(pause), on_pause(pause))  # noqa: E731
-        return make(CAMERA.K, FAST, pauses=RULE, on_pause=both)
+        return make(CAMERA.K, QUICK, pauses=RULE, on_pause=both)
 
     monkeypatch.setattr(mstfilter, "Stream", stream, raising=False)
     return found

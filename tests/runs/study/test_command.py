@@ -17,7 +17,7 @@ from mstfilter.runs.presets import load_config
 from mstfilter.runs.study import JobOutcome
 from tests.app.test_cli import HEAVY, call, python
 from tests.runs.study.scenes import slide
-from tests.runs.study.test_failures import BROKEN, FAST, hanging_study, wait_for
+from tests.runs.study.test_failures import BROKEN, FAST, LIGHT, hanging_study, wait_for
 
 
 @pytest.fixture
@@ -52,8 +52,10 @@ def test_it_prints_where_and_what(config, tmp_path, capsys):
 def test_without_a_terminal_each_finished_run_is_a_line(config, tmp_path, monkeypatch):
     """Also if a variable asks for colours. The run that fails is named with its error."""
     monkeypatch.setenv("FORCE_COLOR", "1")
-    own = f'[[arms]]\nset = ["transition={BROKEN}:Breaks", "transition.how=raise"]\nname = "broken"\n'
-    config.write_text(f'seeds = "0-1"\nscenes = [{{recordings = "slide"}}]\n[[arms]]\npreset = "{FAST}"\n{own}')
+    own = f'[[arms]]\nset = ["transition={BROKEN}:Breaks", "transition.how=raise", "{LIGHT}"]\nname = "broken"\n'
+    config.write_text(
+        f'seeds = "0-1"\nscenes = [{{recordings = "slide"}}]\n[[arms]]\npreset = "{FAST}"\nset = "{LIGHT}"\n{own}'
+    )
     command = [sys.executable, "-m", "mstfilter", "study", str(config), "--workers", "1"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert done.returncode == 1

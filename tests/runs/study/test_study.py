@@ -130,8 +130,8 @@ def test_a_worker_with_other_code_refuses():
 
 def test_arms_that_use_the_ground_truth_are_marked(folder, tmp_path):
     data = {"name": "s", "folder": folder, "scenes": [{"recordings": "slide-0"}], "seeds": [0]}
-    arms = [{"preset": "mst"}]
-    arms.append({"name": "oracle", "preset": "mst", "set": ['update.evidence=["true_quality"]']})
+    arms = [{"preset": "mst", "set": ["n_proposed=2"]}]
+    arms.append({"name": "oracle", "preset": "mst", "set": ["n_proposed=2", 'update.evidence=["true_quality"]']})
     result = run_here(study_of({**data, "arms": arms}), tmp_path / "out", cache=tmp_path / "cache")
     assert result.failed == ()
     assert result.folder.truth_users == {"oracle": ["TrueQuality"]}
