@@ -128,7 +128,15 @@ def test_a_folder_with_files_is_left_alone(tmp_path, capsys, command):
 
 
 def test_simulate_takes_changes_to_the_family(tmp_path, capsys):
-    small = ("n_objects_min=2", "n_objects_max=2", "n_actions=1", "frames_per_clip=5", "width=80", "height=60")
+    small = (
+        "n_objects_min=2",
+        "n_objects_max=2",
+        "n_actions=1",
+        "frames_per_clip=5",
+        "width=80",
+        "height=60",
+        "n_candidates=4",
+    )
     code, _, err = call("simulate", "demo", tmp_path / "out", *small, capsys=capsys)
     assert code == 0, err
     recording = open_recording(tmp_path / "out")

@@ -56,13 +56,10 @@ FILTERS = {
 }
 
 
-SLOW = ("resample-move", "auxiliary, wrong priority")  # these resample at every step in the nightly tests only
-
-
 @pytest.mark.parametrize(
     ("name", "trigger"),
     [(name, EssBelow(0.5)) for name in FILTERS]
-    + [pytest.param(name, Always(), marks=[pytest.mark.nightly] * (name in SLOW)) for name in FILTERS],
+    + [pytest.param(name, Always(), marks=[pytest.mark.nightly] * (name != "bootstrap")) for name in FILTERS],
     ids=lambda value: value if isinstance(value, str) else type(value).__name__,
 )
 def test_every_filter_agrees_with_kalman(name, trigger):

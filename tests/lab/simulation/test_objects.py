@@ -16,7 +16,15 @@ from tests.lab.simulation.meshes import box_mesh, cup_mesh, five_objects, write_
 for _name in ("coacd", "trimesh"):
     pytest.importorskip(_name, reason=f"the library {_name} is not installed (the extra `objects`)")
 
-TINY = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 5, "fps": 3.0, "supersample": False}
+TINY = {
+    "width": 160,
+    "height": 120,
+    "n_actions": 1,
+    "frames_per_clip": 5,
+    "fps": 3.0,
+    "supersample": False,
+    "n_candidates": 6,
+}
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ from mstfilter.lab.simulation.shapes import SHAPE_FAMILIES, draw_shape, label_vo
 from mstfilter.lab.simulation.world import FINGER_ID
 from mstfilter.scene import VoxelGrid, render
 
-SMALL = replace(scene_family("demo"), width=160, height=120, frames_per_clip=6, fps=3.0)
+SMALL = replace(scene_family("demo"), width=160, height=120, frames_per_clip=6, fps=3.0, n_candidates=6)
 
 
 def digest(folder):
@@ -41,7 +41,7 @@ def test_same_seed_same_bytes_in_another_process_and_another_seed_differs(record
         "from dataclasses import replace\n"
         "from mstfilter.lab.simulation.families import scene_family\n"
         "from mstfilter.lab.simulation.recorder import simulate_recording\n"
-        "f = replace(scene_family('demo'), width=160, height=120, frames_per_clip=6, fps=3.0)\n"
+        "f = replace(scene_family('demo'), width=160, height=120, frames_per_clip=6, fps=3.0, n_candidates=6)\n"
         f"simulate_recording(f, 3, {str(tmp_path / 'again')!r})\n"
     )
     subprocess.run([sys.executable, "-c", program], check=True, timeout=600)
@@ -168,7 +168,15 @@ def test_images_poses_and_volumes_agree(recording):
         np.testing.assert_array_equal(label_voxels(scene.objects.shapes, shown, recording.grid), recording.truth(t))
 
 
-TINY = {"width": 80, "height": 60, "n_actions": 1, "frames_per_clip": 3, "fps": 1.0, "supersample": False}
+TINY = {
+    "width": 80,
+    "height": 60,
+    "n_actions": 1,
+    "frames_per_clip": 3,
+    "fps": 1.0,
+    "supersample": False,
+    "n_candidates": 4,
+}
 
 
 def test_a_cached_recording_is_simulated_once(tmp_path, monkeypatch):
