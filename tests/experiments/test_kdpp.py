@@ -39,13 +39,14 @@ def test_output_weights_by_enumeration(k, monkeypatch):
     np.testing.assert_allclose(found, np.exp(population.log_weights + 700) / 5, rtol=1e-9)
 
 
+@pytest.mark.nightly
 def test_sets_by_enumeration():
     """Chi-square of all 35 sets of three; false alarm 1e-6."""
     population, rng = example(7), np.random.default_rng(1)
     sets, p = sets_of(population, 3)
     spectrum, number = kdpp.Spectrum.of(kdpp.KDpp().likelihood(population), 3), {s: i for i, s in enumerate(sets)}
-    drawn = [number[tuple(kdpp.sample_kdpp(rng, spectrum, 3).tolist())] for _ in range(8000)]
-    found, expected = np.bincount(drawn, minlength=len(sets)), 8000 * p
+    drawn = [number[tuple(kdpp.sample_kdpp(rng, spectrum, 3).tolist())] for _ in range(20_000)]
+    found, expected = np.bincount(drawn, minlength=len(sets)), 20_000 * p
     often = expected > 5
     found, expected = np.append(found[often], found[~often].sum()), np.append(expected[often], expected[~often].sum())
     assert stats.chisquare(found, expected).pvalue > 1e-6

@@ -85,6 +85,7 @@ def test_a_guided_move_is_an_importance_draw_of_the_motion_model():
     assert chi_square(x, joint / joint.sum()) > FALSE_ALARM
 
 
+@pytest.mark.nightly
 def test_a_missing_observation_moves_the_particles_only():
     _, observations = WORLD.simulate(np.random.default_rng(5), 3)
     observations = [observations[0], None, observations[2]]

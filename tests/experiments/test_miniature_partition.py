@@ -86,6 +86,7 @@ def test_the_table_is_asked_about_what_the_observation_and_the_latest_view_show(
     np.testing.assert_array_equal(completer.log[0][1], np.stack([now, past]))
 
 
+@pytest.mark.nightly
 def test_a_fit_learns_that_surface_is_occupied_and_is_the_same_again():
     world = Miniature((3, 2))
     completer, pairs = fit(world, range(12), n=5)

@@ -8,9 +8,9 @@ import pytest
 import mstfilter.base.files
 from tests.experiments.scripts import EXPERIMENTS, own_modules
 
-POINTS = {"run": 4, "run --replace": 3, "study": 2, "simulate": 2, "save_recording": 9, "demo": 3, "write_masks": 18}
+POINTS = {"run": 6, "run --replace": 6, "study": 2, "simulate": 2, "save_recording": 9, "demo": 3, "write_masks": 18}
 
-LONG = ("run --replace", "study", "simulate", "demo")
+LONG = ("run", "run --replace", "study", "simulate", "demo")
 
 
 @pytest.fixture(scope="module")

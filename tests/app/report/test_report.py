@@ -97,7 +97,7 @@ def test_only_times_differ_between_equal_runs(finished, tmp_path):
 
 @pytest.mark.parametrize(
     "kind",
-    [{"pauses": 2, "truth": False}, {"pauses": 1, "empty": True}, {"pauses": 1, "truth": False, "empty": True}],
+    [{"pauses": 1, "empty": True}, {"pauses": 1, "truth": False}],
 )
 def test_kinds_of_runs(kind, tmp_path):
     _text, page = read(write_report(make_run(tmp_path / "run", **kind)))
@@ -109,6 +109,7 @@ def test_kinds_of_runs(kind, tmp_path):
         assert "with 0 objects" in page.text
 
 
+@pytest.mark.nightly
 def test_truth_at_some_pauses_only(tmp_path):
     run = make_run(tmp_path / "run", pauses=2)
     (run.pause(1) / "truth.npz").unlink()
