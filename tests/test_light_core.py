@@ -66,19 +66,17 @@ def test_data_summaries_parameters_and_comparisons():
 @pytest.mark.parametrize(
     "arguments, says",
     [
-        ([], "Without typer, only `list`, --help and --version"),
-        (["--help"], "pip install mstfilter"),
-        (["--version"], "mstfilter 0."),
-        (["list"], "not available: pip install opencv-python-headless"),
-        (["list"], "\nfamilies:\n"),
-        (["list", "resamplers"], "systematic          Makes floor or ceil"),
-        (["list", "resamplers"], "scheme=multinomial"),
-        (["list", "presets"], "mst                 MST, the default"),
+        ([], ["Without typer, only `list`, --help and --version"]),
+        (["--help"], ["pip install mstfilter"]),
+        (["--version"], ["mstfilter 0."]),
+        (["list"], ["not available: pip install opencv-python-headless", "\nfamilies:\n"]),
+        (["list", "resamplers"], ["systematic          Makes floor or ceil", "scheme=multinomial"]),
+        (["list", "presets"], ["mst                 MST, the default"]),
     ],
 )
 def test_the_command_line_answers(arguments, says):
     done = light(COMMAND, *arguments)
-    assert done.returncode == 0 and says in done.stdout, done.stderr
+    assert done.returncode == 0 and all(words in done.stdout for words in says), done.stderr
 
 
 @pytest.mark.parametrize("arguments", [["simulate", "demo", "out"], ["run", "recording"], ["check", "update.union"]])

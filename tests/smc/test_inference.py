@@ -123,7 +123,7 @@ def as_path(name, states):
     return {"k": states} if name in ("program", "guided program", "switch") else states
 
 
-@pytest.mark.parametrize("name", ["vector", "no density", "guided"])
+@pytest.mark.parametrize("name", ["vector", pytest.param("no density", marks=pytest.mark.nightly), "guided"])
 def test_conditional_smc_keeps_the_law_of_paths(name):
     """Chi-square of the paths after three sweeps from paths that are drawn from the exact posterior."""
     n = 300
@@ -155,10 +155,10 @@ def test_conditional_smc_keeps_the_law_of_paths(name):
     ],
 )
 def test_conditional_smc_is_the_same_for_every_form_of_a_model(name, same):
-    """The same paths from the same streams, in chains of 60 sweeps; values that a program returns have no density."""
+    """The same paths from the same streams, in chains of 30 sweeps; values that a program returns have no density."""
     one, other = (conditional_path(CONDITIONAL[form], SYMBOLS) for form in (name, same))
     distinct = set()
-    for seed in range(60):
+    for seed in range(30):
         one = conditional_path(CONDITIONAL[name], SYMBOLS, seed, one)
         other = conditional_path(CONDITIONAL[same], SYMBOLS, seed, other)
         np.testing.assert_array_equal(states_of(one), other)
@@ -349,7 +349,9 @@ def metropolis(rng, theta, path):
     return new if np.log(rng.random()) < gain + log_prior(new) - log_prior(theta) else theta
 
 
-@pytest.mark.parametrize(("draw", "n_iterations"), [(conjugate, 50), (metropolis, 30)])
+@pytest.mark.parametrize(
+    ("draw", "n_iterations"), [(conjugate, 50), pytest.param(metropolis, 30, marks=pytest.mark.nightly)]
+)
 def test_particle_gibbs_has_the_exact_posterior(draw, n_iterations):
     means, squares = [], []
     for seed in range(10):

@@ -22,6 +22,7 @@ from mstfilter.runs.study.study import run_study
 from mstfilter.runs.study.worker import perform
 from mstfilter.scene import Cache
 from tests.runs.study.scenes import metrics, run_here, slide, table
+from tests.runs.study.test_failures import LIGHT
 
 BASE = """
 description = "test"
@@ -130,8 +131,8 @@ def test_a_worker_with_other_code_refuses():
 
 def test_arms_that_use_the_ground_truth_are_marked(folder, tmp_path):
     data = {"name": "s", "folder": folder, "scenes": [{"recordings": "slide-0"}], "seeds": [0]}
-    arms = [{"preset": "mst"}]
-    arms.append({"name": "oracle", "preset": "mst", "set": ['update.evidence=["true_quality"]']})
+    arms = [{"preset": "mst", "set": ["n_proposed=2"]}]
+    arms.append({"name": "oracle", "preset": "mst", "set": ["n_proposed=2", 'update.evidence=["true_quality"]']})
     result = run_here(study_of({**data, "arms": arms}), tmp_path / "out", cache=tmp_path / "cache")
     assert result.failed == ()
     assert result.folder.truth_users == {"oracle": ["TrueQuality"]}
@@ -237,7 +238,8 @@ def own(folder, tmp_path, monkeypatch):
     """The data of a study, in a working folder with own metrics."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "own.py").write_text(OWN)
-    arms = [{"preset": "floor_components"}, {"preset": "floor_components", "name": "one", "set": ["n=1"]}]
+    light = {"preset": "floor_components", "set": [LIGHT]}
+    arms = [{**light, "name": "floor_components"}, {**light, "name": "one", "set": [LIGHT, "n=1"]}]
     return {"name": "s", "folder": folder, "scenes": [{"recordings": "slide-*"}], "seeds": [0], "arms": arms}
 
 
