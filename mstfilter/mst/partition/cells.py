@@ -75,6 +75,12 @@ class Readings:
         mask.ravel()[self.pixels[chosen]] = True
         return mask
 
+    def image(self, values: np.ndarray) -> np.ndarray:
+        """Image (H, W) with a value (m,) int at the pixel of each reading, and 0 elsewhere."""
+        found = np.zeros(self.shape, np.int64)
+        found.ravel()[self.pixels] = values
+        return found
+
     def of_image(self, image: np.ndarray) -> np.ndarray:
         """Value (m,) of an image (H, W) at each reading."""
         return np.asarray(image.ravel()[self.pixels])

@@ -33,6 +33,10 @@ anew from everything that was seen of it.
 
 At the first pause the candidates are the distinct samples, and every segment is a new object. So a hypothesis
 contains only objects that some frame has shown.
+
+The notes of the result contain all candidates as segmentations of the last frame with their weights
+(`mstfilter.scene.WeightedSegmentations`). A belief reads its probabilities there, rather than from the few hypotheses
+that resampling keeps.
 """
 
 from __future__ import annotations
@@ -62,7 +66,9 @@ from mstfilter.scene import (
     ObjectRecord,
     ObjectView,
     Projection,
+    WeightedSegmentations,
     check_grids,
+    common_refinement,
     foreground,
     log_quality,
     surface_agreement,
@@ -176,6 +182,7 @@ class PartitionUpdate(Update):
             assert proposed is not None
             described, segments = _distinct(proposed, _segments(proposed, readings, raised))
             objects_of = partial(_new_objects, segments)
+            cells_of, partitions = _refined(segments)
         else:
             projected = self._project(predicted, observation)
             if proposed is None:
@@ -187,6 +194,9 @@ class PartitionUpdate(Update):
             choices = self._choices(cells, predictions, projected.log_weights, mended)
             described = choices.described(projected)
             objects_of = partial(self._associate, cells, predictions, choices)
+            cells_of, partitions = cells.of_reading + 1, choices.partitions
+        seen = WeightedSegmentations(readings.image(cells_of), partitions, described.weights)
+        described = replace(described, notes={**described.notes, "segmentations": seen})
         key = key_of(rng)
 
         def build(candidate: int) -> Hypothesis:
@@ -365,6 +375,12 @@ def _distinct(proposed: Population, segments: Sequence[np.ndarray]) -> tuple[Pop
     example = np.unique(which, return_index=True)[1]
     merged = proposed.take(example, np.log(np.bincount(which, proposed.weights)))
     return merged, [segments[k] for k in example]
+
+
+def _refined(segments: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """The cell (m,) of each reading, 0 for none, and the segment (s, K) of each cell in each sample (m,)."""
+    found = common_refinement(segments)
+    return found.cells, found.objects[:, 1:]
 
 
 def _new_objects(segments: Sequence[np.ndarray], candidate: int) -> tuple[list[SceneObject], list[ObjectRecord]]:

@@ -30,7 +30,7 @@ __interfaces__ = {"boundary": "BoundaryModel", "tree": "TreeBuilder", "value": "
 __components__ = {
     "proposal": {"tree_cuts": "TreeCutProposal"},
     "boundary": {"colour_depth": "ColourDepthBoundary"},
-    "tree": {"learned": "LearnedTree", "ucm": "UcmTree", "border": "BorderTree"},
+    "tree": {"learned": "LearnedTree", "ucm": "UcmTree", "border": "BorderTree", "seams": "SeamTree"},
     "value": {"scenecut": "SceneCutObjectness", "merge_log_odds": "MergeLogOdds"},
     "sampler": {"mh": "MetropolisHastingsCuts", "exact": "ExactCuts", "optimal": "OptimalCut"},
 }
