@@ -94,9 +94,8 @@ class Belief:
         Hypotheses on one grid with unnormalised log weights, such as ``state.population``. Those that are equal are
         merged, and those of weight 0 are ignored.
     seen : WeightedSegmentations, optional
-        All segmentations of the last image that the filter has weighed. They answer the questions about pixels of
-        images of the same size (`same_object_at_pixels`, `open_borders`, `disagreement`), so ask these questions with
-        the camera of the last image.
+        All segmentations of the last image that the filter has weighed. If asked with the camera of this image,
+        `same_object_at_pixels`, `open_borders` and `disagreement` answer from them.
     """
 
     population: Population
@@ -390,7 +389,7 @@ class Belief:
 
     def _refined_image(self, camera: Camera) -> tuple[CommonRefinement, np.ndarray]:
         """The common refinement of the label images, and their weights."""
-        if self.seen is not None and self.seen.cells.shape == (camera.height, camera.width):
+        if self.seen is not None and self.seen.are_of(camera):
             return self.seen.refinement, self.seen.weights
         images, keys = self._images(camera), [h.key for h in self._merged[0]]
         return memo("refined image", (camera.key, *keys), lambda: common_refinement(images)), self._mass

@@ -71,6 +71,7 @@ from mstfilter.scene import (
     common_refinement,
     foreground,
     log_quality,
+    posed_camera,
     surface_agreement,
 )
 from mstfilter.smc import Candidates, Key, Population, Update, first_seen, key_of
@@ -195,7 +196,7 @@ class PartitionUpdate(Update):
             described = choices.described(projected)
             objects_of = partial(self._associate, cells, predictions, choices)
             cells_of, partitions = cells.of_reading + 1, choices.partitions
-        seen = WeightedSegmentations(readings.image(cells_of), partitions, described.weights)
+        seen = WeightedSegmentations(readings.image(cells_of), partitions, described.weights, posed_camera(mended.after))
         described = replace(described, notes={**described.notes, "segmentations": seen})
         key = key_of(rng)
 

@@ -35,7 +35,7 @@ _MOST = {"upright": 6, "level": 3, "tree": 5, "middle": 4}  # divisions of each 
 _SAME = 0.9  # two divisions with a larger overlap (IoU of both sides) are the same
 _LEAST_SHARE, _LEAST_PIXELS = 0.04, 150  # of a side; pixels of an image of 640 x 480
 _MARGIN = 3  # pixels of an image 640 wide: evidence so close to the outline of a region is that of the outline
-_MOST_POINTS = 4000  # readings that vote for planes
+_MOST_POINTS = 2500  # readings that vote for planes
 
 
 class Division(NamedTuple):

@@ -39,6 +39,7 @@ _KNOWN = -6.0  # log odds: merges of the base tree below this are no divisions t
 _SURE = -5.0  # most log odds of merges inside a region that is judged to be one object
 _LEAST_PIXELS = 400  # of a region that is examined, in an image of 640 x 480
 _MOST_DEPTH = 4  # divisions of a region that follow one another
+_FOLLOWED = -1.5  # log odds of a division above which its sides are examined
 _MOST_MERGES = 8  # of the base tree that are examined in a region
 
 
@@ -61,7 +62,7 @@ class SeamTree(TreeBuilder):
     base: BorderTree = field(default_factory=BorderTree)
     weights: str = "seams"
     one_log_odds: float = 0.0
-    least: Share = 0.01
+    least: Share = 0.02
 
     @property
     def bound_key(self) -> bytes:
@@ -203,10 +204,10 @@ class _Examination:
             found = divisions(self.image, pixels, parts)
             log_odds, best = self._judged(pixels, found)
             if log_odds > np.log(self.builder.least / (1 - self.builder.least)):
+                # The sides of an improbable division are seldom in a sample, so they are not examined.
+                depth = depth + 1 if log_odds > _FOLLOWED else _MOST_DEPTH + 1
                 side = found[best].side
-                below = [
-                    self._examined(node, pixels[one], [part[one] for part in parts], depth + 1) for one in (side, ~side)
-                ]
+                below = [self._examined(node, pixels[one], [part[one] for part in parts], depth) for one in (side, ~side)]
                 return self._join(below[0], below[1], float(log_odds))
         return self._kept(node, pixels)
 
