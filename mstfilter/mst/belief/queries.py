@@ -74,6 +74,8 @@ class Border(NamedTuple):
 
     one_object: float  #: probability that both sides are one object, if both are objects
     pixels: np.ndarray  #: (m, 2) pixels (column, row) on the border
+    #: (2, H, W) bool, the two objects on its sides in the most probable segmentation in which they are two
+    sides: np.ndarray
 
     @property
     def middle(self) -> np.ndarray:
@@ -218,7 +220,7 @@ class Belief:
 
         R_i is the label image of hypothesis i. `a` and `b` (..., 2) are pixels (column, row); they are broadcast.
         """
-        refined, mass = self._refined_image(camera)
+        refined, mass = self.refined_image(camera)
         a, b = _rows_and_columns(camera, a), _rows_and_columns(camera, b)
         objects_a, objects_b = refined.objects[:, refined.cells[a]], refined.objects[:, refined.cells[b]]
         return np.tensordot(mass, (objects_a == objects_b) & (objects_a > 0), axes=1)
@@ -261,7 +263,7 @@ class Belief:
         object that hypothesis i shows at the pixel, and J is the Jaccard index. J is 1 if neither hypothesis shows an
         object at the pixel, and 0 if only one hypothesis shows an object.
         """
-        refined, mass = self._refined_image(camera)
+        refined, mass = self.refined_image(camera)
         shared = refined.overlaps()
         union = np.add.outer(shared.diagonal(), shared.diagonal()) - shared
         jaccard = np.divide(shared, union, out=np.ones_like(shared), where=union > 0)
@@ -283,7 +285,7 @@ class Belief:
         of one object with the same answer in all hypotheses are one border.
         """
         check_number("at_least", at_least, at_least=0, at_most=0.5)
-        refined, mass = self._refined_image(camera)
+        refined, mass = self.refined_image(camera)
         least = scaled_area(_LEAST_PART, camera.width * camera.height)
         small = (refined.sizes < least)[refined.cells]
         nearest = distance_transform_edt(small, return_distances=False, return_indices=True)
@@ -297,7 +299,11 @@ class Belief:
             borders.setdefault(np.concatenate([both[:, k], same[:, k], of_a[same[:, k], k]]).tobytes(), []).append(k)
         doubt = {key: p_both[k[0]] * float(binary_entropy(one[k[0]])) for key, k in borders.items()}
         order = sorted(doubt, key=lambda key: -doubt[key])
-        return [Border(float(one[borders[k][0]]), pixels[borders[k]]) for k in order if len(borders[k]) ** 2 >= least]
+        return [
+            Border(float(one[borders[k][0]]), pixels[borders[k]], _sides(refined, mass, a, b, borders[k]))
+            for k in order
+            if len(borders[k]) ** 2 >= least
+        ]
 
     def partition_entropy(self, tolerance: float = 0.0) -> float:
         """Entropy of the segmentation of the scene, in nats.
@@ -387,8 +393,8 @@ class Belief:
         hypotheses, mass = self._merged
         return hypotheses[least_loss([h.labels for h in hypotheses], mass)]
 
-    def _refined_image(self, camera: Camera) -> tuple[CommonRefinement, np.ndarray]:
-        """The common refinement of the label images, and their weights."""
+    def refined_image(self, camera: Camera) -> tuple[CommonRefinement, np.ndarray]:
+        """The cells of the segmentations that a camera sees, and the weights (n,) of the segmentations."""
         if self.seen is not None and self.seen.are_of(camera):
             return self.seen.refinement, self.seen.weights
         images, keys = self._images(camera), [h.key for h in self._merged[0]]
@@ -397,6 +403,16 @@ class Belief:
     def _images(self, camera: Camera) -> list[np.ndarray]:
         check_component("camera", camera, Camera)
         return [project(h, camera) for h in self._merged[0]]
+
+
+def _sides(refined: CommonRefinement, mass: np.ndarray, a: np.ndarray, b: np.ndarray, at: list[int]) -> np.ndarray:
+    """Both objects (2, H, W) bool at the pairs `at` of neighbouring cells a, b, where they are most probably two."""
+    first, second = refined.objects[:, a[at]], refined.objects[:, b[at]]
+    two = (first > 0) & (second > 0) & (first != second)
+    best = int((mass * two.any(axis=1)).argmax())
+    k = at[int(two[best].argmax())]
+    row = refined.objects[best]
+    return np.stack([(row == row[cell])[refined.cells] for cell in (a[k], b[k])])
 
 
 def _check_indices(name: str, index: np.ndarray, shape: tuple[int, ...], hint: str) -> None:
