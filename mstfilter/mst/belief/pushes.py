@@ -217,7 +217,8 @@ class _Scene:
             return False
         steps = np.arange(0.0, push.clearance - self.radius, grid.voxel_size / 2)
         around = self.radius * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
-        heights = np.arange(max(float(grid.origin[2]), 0.0) + grid.voxel_size, _TOP, grid.voxel_size)
+        tip = float(push.contact[2]) - self.radius  # the tool comes from above
+        heights = np.arange(tip, max(_TOP, tip + 2 * self.radius), grid.voxel_size)
         way = push.start[:2] + steps[:, None] * push.direction[:2]
         columns = (way[:, None] + around).reshape(-1, 2)
         points = np.concatenate([np.repeat(columns, len(heights), 0), np.tile(heights, len(columns))[:, None]], axis=1)

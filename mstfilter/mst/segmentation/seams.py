@@ -11,19 +11,20 @@ of each division. The most probable division becomes the first of the tree below
 >>> w = MergeLogOdds().values(tree, frame)
 
 The judge was trained on scenes in which things that look like two objects are one as often as not. How often that is
-so where the filter is used is a prior, the field `one_log_odds`: 0.85 says that of such things 70 % are one object.
+so where the filter is used is a prior, the field `one_share`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from math import log
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
 from mstfilter.base.errors import InputError
-from mstfilter.base.fields import Share
+from mstfilter.base.fields import Bounds, Share
 from mstfilter.mst.segmentation.divisions import Division, SeamImage, divisions
 from mstfilter.mst.segmentation.learned_tree import Agglomeration, BorderTree, pair_log_odds, tree_of_merges
 from mstfilter.mst.segmentation.regions import Regions, SeenBorders
@@ -53,15 +54,15 @@ class SeamTree(TreeBuilder):
         The tree whose regions are examined.
     weights : str
         Name of a trained model of the package, or the path of a model folder: the judge.
-    one_log_odds : float
-        Prior log odds of one object against several, added to those of the judge, in which they are even.
+    one_share : float
+        Prior probability that what may be one object or several is one. The judge was trained where it is 0.5.
     least : float
         A region is divided in the tree if the probability that it is several objects is at least this.
     """
 
     base: BorderTree = field(default_factory=BorderTree)
     weights: str = "seams"
-    one_log_odds: float = 0.0
+    one_share: Annotated[float, Bounds(above=0, below=1)] = 0.5
     least: Share = 0.02
 
     @property
@@ -167,6 +168,7 @@ class _Examination:
         self.uncertain = frozenset(self.base.uncertain())
         self.flat = regions.image.ravel()
         self.measures = SeamMeasures.of(image, regions.image > 0)
+        self.prior = log(builder.one_share / (1 - builder.one_share))
         self.least = least_examined(self.flat.size)
         self.leaves = np.zeros_like(self.flat)  # of the new tree
         self.n_leaves = 1
@@ -216,7 +218,7 @@ class _Examination:
         if not found:
             return -np.inf, -1
         scores = self.judge.scores(*self.measures.describe(pixels, found))
-        return float(np.logaddexp.reduce(scores)) - self.builder.one_log_odds, int(scores.argmax())
+        return float(np.logaddexp.reduce(scores)) - self.prior, int(scores.argmax())
 
     def _kept(self, node: int, pixels: np.ndarray) -> tuple[str, int]:
         """The base tree below a node, restricted to some pixels. Without merges that divide objects."""

@@ -128,11 +128,12 @@ def test_a_sure_judge_keeps_the_regions_of_the_base_tree(touching, judges):
 
 def test_odds_of_a_division_are_those_of_the_judge_and_the_prior(touching, judges):
     frame, image, _, _ = touching
-    trees = [SeamTree(weights=judges[-2.0], one_log_odds=prior).build(image.boundary, frame) for prior in (0.0, 1.5)]
+    shares = (0.5, 0.8)
+    trees = [SeamTree(weights=judges[-2.0], one_share=share).build(image.boundary, frame) for share in shares]
     inner = [tree.odds[tree.n_leaves :] for tree in trees]
     odds = [found[found > -4.9] for found in inner]
-    for prior, found in zip((0.0, 1.5), odds, strict=True):
-        n = np.exp(found[found < 3] + 2.0 + prior)  # of n divisions with the score -2
+    for share, found in zip(shares, odds, strict=True):
+        n = np.exp(found[found < 2] + 2.0) * share / (1 - share)  # of n divisions with the score -2
         assert len(n) > 1 and np.allclose(n, np.rint(n), atol=0.05) and n.min() > 0.9
 
 
