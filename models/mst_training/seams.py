@@ -1,6 +1,6 @@
 """Training of the judge of seams.
 
->>> run_training(SeamTraining.recipe("cpu"), "seam-model")
+>>> run_training(SeamsTraining.recipe("cpu"), "seam-model")
 
 A batch is a set of regions. If a region is one object, its loss is -log P(one); else it is -log of the probability of
 all divisions that separate its objects cleanly, or -log(1 - P(one)) if there is none. So the judge need not choose
@@ -32,7 +32,7 @@ _TURNED = [CHANNELS.index(name) for name in ("slope across", "distance")]  # cha
 
 
 @dataclass(frozen=True)
-class SeamTraining(Training):
+class SeamsTraining(Training):
     """Settings of the training of the judge. A scene gives about 20 regions with a dozen divisions each."""
 
     n_scenes: int = 600

@@ -57,6 +57,7 @@ from mstfilter.mst.completion import Completer, Completion, Extrude, arbitrate, 
 from mstfilter.mst.partition.association import Overlaps, recognised
 from mstfilter.mst.partition.candidates import Choices, largest
 from mstfilter.mst.partition.cells import Cells, PairEvidence, PairOdds, Readings
+from mstfilter.mst.partition.motions import common_motions
 from mstfilter.scene import (
     Clip,
     Evidence,
@@ -191,7 +192,8 @@ class PartitionUpdate(Update):
             predictions = self._predictions(predicted, projected, readings, observation.after)
             segments = _segments(proposed, readings, raised)
             weights = proposed.weights if np.ptp(proposed.log_weights) else None
-            cells = Cells.of(readings, segments, [one.objects for one in predictions], weights)
+            bodies = [common_motions(one.hypothesis) for one in predictions]
+            cells = Cells.of(readings, segments, [one.objects for one in predictions], weights, bodies)
             choices = self._choices(cells, predictions, projected.log_weights, mended)
             described = choices.described(projected)
             objects_of = partial(self._associate, cells, predictions, choices)
