@@ -35,7 +35,8 @@ _GROUPED = ("row", "stack", "pack")
 _OWN_CAMERA = 0.35  # share of the images that the camera of the family takes
 _N_VIEWS = 3
 _FIRST_SEED = 1_000_000  # of scenes; the studies use smaller ones
-_LEAST_PIXELS, _LEAST_SHARE = 120, 0.05  # of an object in a region
+#: An object counts if so many of its pixels are in a region, and such a share of the region or of its own pixels.
+_LEAST_PIXELS, _LEAST_SHARE, _LEAST_OWN = 120, 0.15, 0.4
 _WHOLE = 0.7  # share of each object that must be on one side of a division that separates objects
 _PLAIN = {True: 0.85, False: 0.65}  # share of the regions of one object that are used, in scenes with groups or not
 _MOST_DEPTH = 3
@@ -123,13 +124,14 @@ def _regions(
     image = SeamImage.of(found.frame, boundary, seen)
     measures = SeamMeasures.of(image, regions.image > 0)
     flat = instance.ravel()
+    visible = np.bincount(flat[regions.image.ravel() > 0], minlength=256)
     for node in base.uncertain():
         todo = [(*base.region(node), 0)]
         while todo:
             pixels, parts, depth = todo.pop()
             if len(pixels) < least_examined(flat.size) or not (divided := divisions(image, pixels, parts)):
                 continue
-            purity, n = _purity(flat[pixels], divided)
+            purity, n = _purity(flat[pixels], divided, visible)
             if n == 0 or (n == 1 and depth == 0 and rng.uniform() > _PLAIN[grouped]):
                 continue
             yield (*measures.describe(pixels, divided), purity, n, depth, grouped)
@@ -144,11 +146,15 @@ def _regions(
                 todo += [(pixels[one], [part[one] for part in parts], depth + 1) for one in (side, ~side)]
 
 
-def _purity(instance: np.ndarray, divided: list[Division]) -> tuple[np.ndarray, int]:
-    """`SeamSamples.purity` (k,) of divisions of a region with these objects (n,), and the number of its objects."""
-    sizes = np.bincount(instance, minlength=1)
+def _purity(instance: np.ndarray, divided: list[Division], visible: np.ndarray) -> tuple[np.ndarray, int]:
+    """`SeamSamples.purity` (k,) of divisions of a region with these objects (n,), and the number of its objects.
+
+    `visible` has the number of pixels of each object in the image.
+    """
+    sizes = np.bincount(instance, minlength=256)
     sizes[0] = 0
-    large = np.flatnonzero(sizes > max(_LEAST_PIXELS, _LEAST_SHARE * sizes.sum()))
+    enough = (sizes > _LEAST_SHARE * sizes.sum()) | (sizes > _LEAST_OWN * visible)
+    large = np.flatnonzero((sizes > _LEAST_PIXELS) & enough)
     purity = np.zeros(len(divided), np.float32)
     for k, division in enumerate(divided):
         first = np.array([division.side[instance == one].mean() for one in large])

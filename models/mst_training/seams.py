@@ -91,15 +91,15 @@ class SeamsTraining(Training):
         judged = _judged(net, test, device)
         scores, *others = judged
         calibrated = (scale * scores + shift, *others)
-        rows: list[dict[str, Any]] = []
-        grouped = test.grouped[np.unique(test.region, return_index=True)[1]]
+        table: list[dict[str, Any]] = []
+        grouped = np.array([test.grouped[rows[0]] for rows in _by_region(test)])
         for name, chosen in (("all", grouped >= 0), ("groups", grouped), ("other scenes", ~grouped)):
-            rows.append({"scenes": name, **_figures(calibrated, torch.from_numpy(chosen))})
+            table.append({"scenes": name, **_figures(calibrated, torch.from_numpy(chosen))})
         described = {
             "network": {"channels": [*INPUTS, *CHANNELS], "width": self.width},
             "calibration": {"scale": scale, "shift": shift},
         }
-        return described, dict(list(rows[0].items())[1:]), rows
+        return described, dict(list(table[0].items())[1:]), table
 
 
 def region_losses(scores: Tensor, purity: Tensor, region: Tensor, objects: Tensor) -> tuple[Tensor, Tensor]:
@@ -123,10 +123,19 @@ def region_losses(scores: Tensor, purity: Tensor, region: Tensor, objects: Tenso
 
 
 def _by_region(samples: SeamSamples) -> list[np.ndarray]:
-    """The rows of each region."""
+    """The rows of each region.
+
+    The side of a division may hold a piece of the other object that no further division separates. Such a region is
+    neither one object nor two, and is left out.
+    """
     order = np.argsort(samples.region, kind="stable")
     starts = np.unique(samples.region[order], return_index=True)[1]
-    return np.split(order, starts[1:])
+    rows = np.split(order, starts[1:])
+    return [
+        one
+        for one in rows
+        if samples.depth[one[0]] == 0 or samples.objects[one[0]] < 2 or samples.purity[one].max() >= _CLEAN
+    ]
 
 
 def _batch(samples: SeamSamples, regions: list[np.ndarray]) -> tuple[Tensor, ...]:
@@ -165,7 +174,7 @@ def _figures(judged: _Judged, chosen: Tensor | None = None) -> dict[str, float]:
     table = ForecastTable.of(p, one, np.ones(len(p)))
     return {
         "regions": float(keep.sum()),
-        "loss": float(losses[keep].mean()),
+        "region_loss": float(losses[keep].mean()),
         "one_log_loss": table.log_loss(0.001),
         "one_calibration_error": table.reliability().error,
         "one_share": float(one.mean()),

@@ -59,7 +59,7 @@ class SeamNet(nn.Module):
 
 def decoded(strips: np.ndarray) -> Tensor:
     """Strips (k, c, *STRIP) uint8 as numbers."""
-    return (torch.from_numpy(strips).float() - 128) / 64
+    return ((torch.from_numpy(strips).float() - 128) / 64).contiguous(memory_format=torch.channels_last)
 
 
 class SeamNetwork:
