@@ -58,7 +58,9 @@ from mstfilter.smc import Codec, Info, State, load_state, save_state
 _FORMAT = 2
 _SEGMENTATIONS = "segmentations"  # note of an update, see `PartitionUpdate`
 _RESUME = "repeat the command that made the run, to resume it"
-_PAUSE_FILES = rf"(rgb\.png|instance\.png|camera\.json|state\.npz|truth\.npz|segmentations\.npz|info\.json|seconds\.json|{SUMS})"
+_PAUSE_FILES = (
+    rf"(rgb\.png|instance\.png|camera\.json|state\.npz|truth\.npz|segmentations\.npz|info\.json|seconds\.json|{SUMS})"
+)
 _TABLES = rf"(run\.json|metrics\.csv|(report|view)\.html|result\.json|forecasts\.npz|{SUMS})"
 RUN_FILES = re.compile(rf"(compare/[^/]+/)?(pauses/\d+/{_PAUSE_FILES}|{_TABLES})")  #: paths in a run folder
 

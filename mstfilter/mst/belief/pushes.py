@@ -114,7 +114,8 @@ def _box(reach: Any, grid: VoxelGrid) -> np.ndarray:
         raise InputError(f"reach is {reach!r}, expected two corners of a box", hint)
     if (box[1] <= grid.origin).any() or (box[0] >= grid.upper).any():
         raise InputError(
-            f"nothing of the grid ({grid.origin.tolist()} to {grid.upper.tolist()} m) is in reach {box.tolist()}", hint
+            f"nothing of the grid ({grid.origin.tolist()} to {grid.upper.tolist()} m) is in reach {box.tolist()}",
+            hint,
         )
     return box
 
@@ -221,7 +222,9 @@ class _Scene:
         heights = np.arange(tip, max(_TOP, tip + 2 * self.radius), grid.voxel_size)
         way = push.start[:2] + steps[:, None] * push.direction[:2]
         columns = (way[:, None] + around).reshape(-1, 2)
-        points = np.concatenate([np.repeat(columns, len(heights), 0), np.tile(heights, len(columns))[:, None]], axis=1)
+        points = np.concatenate(
+            [np.repeat(columns, len(heights), 0), np.tile(heights, len(columns))[:, None]], axis=1
+        )
         index = grid.index_of(points)
         index = index[grid.contains(index)]
         return bool((self.belief.occupancy()[tuple(index.T)] < _OCCUPIED).all())

@@ -115,7 +115,7 @@ class Belief:
 
     @classmethod
     def of_step(cls, state: State, info: Info) -> Belief:
-        """The belief after a step of a filter, with all segmentations that its update has weighed, if it notes them."""
+        """The belief after a step, with all segmentations that the update has weighed, if it notes them."""
         if state.population is None:
             raise InputError("the state has no particles before the first step", "state, info = filter.step(...)")
         return cls(state.population, info.notes.get("update", {}).get("segmentations"))
@@ -269,9 +269,7 @@ class Belief:
         jaccard = np.divide(shared, union, out=np.ones_like(shared), where=union > 0)
         rows = refined.objects
         same = sum(
-            w * v * jaccard[a, b]
-            for w, a in zip(mass, rows, strict=True)
-            for v, b in zip(mass, rows, strict=True)
+            w * v * jaccard[a, b] for w, a in zip(mass, rows, strict=True) for v, b in zip(mass, rows, strict=True)
         )
         return np.clip(1 - same, 0, 1)[refined.cells]
 

@@ -198,7 +198,9 @@ class PartitionUpdate(Update):
             described = choices.described(projected)
             objects_of = partial(self._associate, cells, predictions, choices)
             cells_of, partitions = cells.of_reading + 1, choices.partitions
-        seen = WeightedSegmentations(readings.image(cells_of), partitions, described.weights, posed_camera(mended.after))
+        seen = WeightedSegmentations(
+            readings.image(cells_of), partitions, described.weights, posed_camera(mended.after)
+        )
         described = replace(described, notes={**described.notes, "segmentations": seen})
         key = key_of(rng)
 

@@ -313,7 +313,7 @@ class MergedTree(TreeBuilder):
     def regions(
         self, boundary: np.ndarray, frame: Frame, pixels: np.ndarray, seen: SeenBorders | None = None
     ) -> Regions:
-        """The leaves with their measurements. `pixels` (H, W) bool are the pixels of objects, `seen` that of `look`."""
+        """The leaves with their measurements, from the pixels (H, W) bool of objects and the result of `look`."""
         leaves = object_leaves(self.leaves.build(boundary, frame).leaves, pixels)
         return measure_regions(leaves, frame, boundary, self.look(frame) if seen is None else seen)
 

@@ -99,7 +99,7 @@ class SeamMeasures:
         return [full, half]
 
     def describe(self, pixels: np.ndarray, found: list[Division]) -> tuple[np.ndarray, np.ndarray]:
-        """Features (k, f) float32 and strips (k, c, *STRIP) uint8 of divisions of the region with flat pixels (n,)."""
+        """Features (k, f) float32 and strips (k, c, *STRIP) uint8 of divisions of a region with flat pixels (n,)."""
         region = _Region(self, pixels)
         x = np.column_stack([region.pair_features(found), region.seam_features(found)])
         strips = np.stack([region.strip(division) for division in found])
@@ -205,7 +205,7 @@ class _Region:
         return np.array(rows)
 
     def _hulls(self, part: np.ndarray) -> tuple[float, float, float]:
-        """Areas of the convex hull in the image (pixels), of that on the ground, and of the smallest rectangle (m2)."""
+        """Areas of the convex hull in the image (pixels) and on the ground, and of the smallest rectangle (m2)."""
         rows, columns = self.rows[part], self.columns[part]
         new = np.flatnonzero(np.diff(rows, prepend=-1))  # pixels are in the order of the rows
         ends = np.concatenate([new, np.append(new[1:], len(rows)) - 1])

@@ -27,7 +27,7 @@ from mstfilter.base.errors import InputError
 from mstfilter.base.fields import Bounds, Share
 from mstfilter.mst.segmentation.divisions import Division, SeamImage, divisions
 from mstfilter.mst.segmentation.learned_tree import Agglomeration, BorderTree, pair_log_odds, tree_of_merges
-from mstfilter.mst.segmentation.regions import Regions, SeenBorders
+from mstfilter.mst.segmentation.regions import Regions
 from mstfilter.mst.segmentation.seam_measures import SeamMeasures
 from mstfilter.mst.segmentation.tree import Tree, TreeBuilder
 from mstfilter.scene import Frame, pixels_above_table, scaled_area, scaled_length
@@ -209,7 +209,9 @@ class _Examination:
                 # The sides of an improbable division are seldom in a sample, so they are not examined.
                 depth = depth + 1 if log_odds > _FOLLOWED else _MOST_DEPTH + 1
                 side = found[best].side
-                below = [self._examined(node, pixels[one], [part[one] for part in parts], depth) for one in (side, ~side)]
+                below = [
+                    self._examined(node, pixels[one], [part[one] for part in parts], depth) for one in (side, ~side)
+                ]
                 return self._join(below[0], below[1], float(log_odds))
         return self._kept(node, pixels)
 

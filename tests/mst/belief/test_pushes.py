@@ -50,7 +50,9 @@ def test_the_most_informative_push_asks_the_most_open_question():
         one[20:30, 8:14, :8] = 4
         one[30:40, 8:14, :8] = 5 if k else 4
     both = [np.maximum(a, b) for a in labels for b in second]
-    belief = Belief(Population(tuple(Hypothesis.from_labels(g, GRID) for g in both), np.log([0.45, 0.05, 0.45, 0.05])))
+    belief = Belief(
+        Population(tuple(Hypothesis.from_labels(g, GRID) for g in both), np.log([0.45, 0.05, 0.45, 0.05]))
+    )
     pushes = push_candidates(belief, CAMERA, REACH)
     assert abs(pushes[0].contact[1]) < 0.06  # the row of which nothing is known, not the probable one
     assert pushes[0].information > pushes[-1].information > 0.1
@@ -98,7 +100,10 @@ def test_a_sure_belief_has_no_pushes():
         ({"reach": None}, "expected two corners of a box"),
         ({"reach": ((0, 0, 0), (0, 1, 1))}, "expected two corners of a box"),
         ({"reach": ((5, 5, 0), (6, 6, 1))}, "nothing of the grid"),
-        ({"belief": Belief(Population((Hypothesis.from_labels(np.zeros(GRID.shape, np.uint16), GRID),)))}, "no objects"),
+        (
+            {"belief": Belief(Population((Hypothesis.from_labels(np.zeros(GRID.shape, np.uint16), GRID),)))},
+            "no objects",
+        ),
         ({"length": -1.0}, "length"),
     ],
 )

@@ -37,7 +37,9 @@ def test_a_turn_about_one_axis_is_one_motion_and_about_two_axes_is_not():
     turn = shift(0.02, 0.03, 20.0)
     bodies = common_motions(moved(turn, turn, None))
     assert bodies[1] == bodies[2] > 0
-    about = RigidTransform.from_translation((-0.08, -0.05, 0)) * turn * RigidTransform.from_translation((0.08, 0.05, 0))
+    about = (
+        RigidTransform.from_translation((-0.08, -0.05, 0)) * turn * RigidTransform.from_translation((0.08, 0.05, 0))
+    )
     bodies = common_motions(moved(turn, about, None))
     assert bodies[1] != bodies[2]
 

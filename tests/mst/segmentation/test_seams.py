@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from mstfilter.base.errors import InputError
 from mstfilter.base.trained import write_model
@@ -26,7 +25,9 @@ ROW = boxes(((20, 20, 0), (32, 34, 10)), ((32, 20, 0), (46, 34, 10)))
 def blind(frame):
     """The output of a border network that sees nothing."""
     h, w = frame.depth.shape
-    return SeenBorders(np.full((h, w), -4.0, np.float32), np.zeros((h, w), np.float32), np.zeros((h, w, 2), np.float32))
+    return SeenBorders(
+        np.full((h, w), -4.0, np.float32), np.zeros((h, w), np.float32), np.zeros((h, w, 2), np.float32)
+    )
 
 
 @pytest.fixture(scope="module")
