@@ -43,6 +43,7 @@ from mstfilter.scene.geometry import (
 from mstfilter.scene.occupancy import Occupancy as Occupancy
 from mstfilter.scene.partitions import (
     CommonRefinement as CommonRefinement,
+    WeightedSegmentations as WeightedSegmentations,
     canonical as canonical,
     common_refinement as common_refinement,
 )
