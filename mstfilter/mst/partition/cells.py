@@ -19,9 +19,9 @@ corresponding weighted share of the predictions. The log odds l of "one object" 
 
 R is the probability that a prediction is valid, W <= R the total weight of the predictions with an object at both
 cells, and M <= W that of the predictions in which both have moved as one body. The update gives one prediction at a
-time a weight above 0, so there f_prediction is 0 or 1. In the logit, 0.02 is added to f and to 1 - f. The coefficients
-are the fields of `PairEvidence`; by default, logit(f_image) is not scaled. The coefficient of the predictions was
-fitted to pairs of cells, and the constants were chosen by a study
+time a weight above 0, so there f_prediction is 0 or 1. In the logit, 0.02 is added to f and to 1 - f. The
+coefficients are the fields of `PairEvidence`; by default, logit(f_image) is not scaled. The coefficient of the
+predictions was fitted to pairs of cells, and the constants were chosen by a study
 (`experiments/weights` and the page of settled studies in the docs).
 
 The alternatives of a component are its partitions in the samples and in the predictions. Where a prediction has no

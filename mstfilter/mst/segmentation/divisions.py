@@ -1,8 +1,8 @@
 """Ways to divide a region of an image into two, and what can be measured of them.
 
 Things that people put down stand beside each other or on each other, so two objects that touch are usually divided
-by an upright or by a level plane. The plane need not be seen everywhere: where print or low contrast hides the border, it
-still goes on. So the divisions of a region are
+by an upright or by a level plane. The plane need not be seen everywhere: where print or low contrast hides the
+border, it still goes on. So the divisions of a region are
 
 - *upright* and *level* planes through its readings along which there is more evidence of a border than beside them,
 - the same planes at the middle and the thirds of the region, where a row of equal things would be divided,
