@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -83,7 +83,7 @@ _Row = tuple[np.ndarray, np.ndarray, np.ndarray, int, int, bool]
 def _rows(rng: np.random.Generator, seed: int) -> Iterator[_Row]:
     """The regions of some images of a scene."""
     name = str(rng.choice([*_FAMILIES], p=[*_FAMILIES.values()]))
-    sensor = str(rng.choice(["xtion", "xtion", "xtion", *SENSORS]))
+    sensor: Any = str(rng.choice(["xtion", "xtion", "xtion", *SENSORS]))
     family = replace(scene_family(name), n_actions=0, catalogue="tuning", sensor=sensor, arm=False, one_share=0.5)
     scene = SimulatedScene(family, seed)
     for _ in range(_N_VIEWS):

@@ -89,8 +89,8 @@ class SeamsTraining(Training):
     ) -> tuple[dict[str, Any], dict[str, float], list[dict[str, Any]]]:
         scale, shift = _calibrated(_judged(net, validation, device))
         judged = _judged(net, test, device)
-        scores, *others = judged
-        calibrated = (scale * scores + shift, *others)
+        scores, purity, region, objects = judged
+        calibrated = (scale * scores + shift, purity, region, objects)
         table: list[dict[str, Any]] = []
         grouped = np.array([test.grouped[rows[0]] for rows in _by_region(test)])
         for name, chosen in (("all", grouped >= 0), ("groups", grouped), ("other scenes", ~grouped)):

@@ -382,7 +382,7 @@ class BorderTree(MergedTree):
         check_weights(network.evidence, FEATURES, f"border model {self.weights!r}", f"{_FIT} --border FOLDER")
         return network.evidence, network.key
 
-    def look(self, frame: Frame) -> SeenBorders | None:
+    def look(self, frame: Frame) -> SeenBorders:
         return self._network().look(frame)
 
     def correction(self) -> PairNetwork | None:
