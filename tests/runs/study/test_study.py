@@ -32,7 +32,7 @@ recordings = "slide-*"
 group = "slide"
 [[arms]]
 preset = "floor_components"
-set = ["resampler=systematic,residual"]
+set = ["resampler=systematic,residual", "proposal.completer=extrude"]
 [smoke]
 seeds = 3
 """
@@ -56,8 +56,8 @@ def test_a_finished_study_repeats_no_run(folder, tmp_path, capsys):
     rows = metrics(tmp_path / "out")
     assert len(rows) == 2 * 2 * 2 * 3
     assert {r["arm"] for r in rows} == {
-        "floor_components resampler=systematic",
-        "floor_components resampler=residual",
+        f"floor_components resampler=systematic {LIGHT}",
+        f"floor_components resampler=residual {LIGHT}",
     }
     assert {(r["scene"], r["family"]) for r in rows} == {("slide-0", "slide"), ("slide-1", "slide")}
     made = {p: p.stat().st_mtime_ns for p in (tmp_path / "out" / "runs").rglob("result.json")}
