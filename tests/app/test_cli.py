@@ -220,7 +220,7 @@ def test_a_light_start(arguments):
         ("mst", ["torch"]),
     ],
 )
-def test_what_the_presets_need(preset, blocked, recording, tmp_path):
+def test_what_the_presets_need(preset, blocked, two_pauses, tmp_path):
     """A run and its report with libraries made unimportable. Only the network of `mst` needs torch, and says so."""
     done = python(
         "import sys\n"
@@ -231,7 +231,7 @@ def test_what_the_presets_need(preset, blocked, recording, tmp_path):
         "sys.meta_path.insert(0, Blocked())\n"
         "from mstfilter.app.cli import main\n"
         "main(sys.argv[1:])",
-        *("run", recording, "n=1", "n_proposed=1", "--preset", preset, "--out", tmp_path / "run"),
+        *("run", two_pauses, "n=1", "n_proposed=1", "--preset", preset, "--out", tmp_path / "run"),
         *(["--no-report"] if preset == "mst" else []),
     )
     if preset == "mst" and "torch" in blocked:

@@ -58,7 +58,7 @@ def test_without_a_terminal_each_finished_run_is_a_line(config, tmp_path, monkey
         'seeds = "0-1"\nscenes = [{recordings = "slide"}]\n'
         f'[[arms]]\nname = "good"\npreset = "{FAST}"\nset = "{LIGHT}"\n{own}'
     )
-    command = [sys.executable, "-m", "mstfilter", "study", str(config), "--workers", "1"]
+    command = [sys.executable, "-m", "mstfilter", "study", str(config), "--workers", "1", "--no-report"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert done.returncode == 1
     lines = [line.split("  ", 1)[1] for line in done.stderr.splitlines() if re.match(r"\d\d:\d\d:\d\d  ", line)]

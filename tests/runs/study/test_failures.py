@@ -46,13 +46,13 @@ def study(folder, *arms, **more):
 def test_failures_are_isolated_listed_and_explained(folder, tmp_path):
     out = tmp_path / "out"
     result = run_study(
-        study(folder, "good", "raise", "full", "die", "print", seeds=[0], tries=1), out, workers=1, cache=tmp_path
+        study(folder, "good", "raise", "full", "die", "print", seeds=[0], tries=2), out, workers=1, cache=tmp_path
     )
     assert result.done == 2
     errors = {(r["run"], r["tries"]): r["error"] for r in table(out, "failures.csv")}
     assert "RuntimeError: the component broke" in errors["raise on slide, seed 0", "1"]
     assert "no space left" in errors["full on slide, seed 0", "1"]
-    assert errors["die on slide, seed 0", "1"] == "its worker died 1 time, the last time by signal 9"
+    assert errors["die on slide, seed 0", "2"] == "its worker died 2 times, the last time by signal 9"
     assert len(errors) == 3
     assert {r["arm"] for r in table(out)} == {"good", "print"}  # the output of a component has no effect
     trace = next(f["trace"] for f in result.folder.failures() if f["arm"] == "raise")
@@ -72,6 +72,7 @@ def test_only_failed_runs_are_repeated(folder, tmp_path):
     assert table(out, "failures.csv") == []
 
 
+@pytest.mark.nightly
 def test_a_run_whose_worker_died_is_begun_again(folder, tmp_path):
     seen = []
     wanted = study(folder, f"exit@{tmp_path / 'once'}", seeds=[0])
