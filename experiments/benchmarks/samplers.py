@@ -69,7 +69,7 @@ def toy_by_tempering(seed: int, n: int, _: dict) -> tuple[float, float]:
 
 
 def toy_by_ibis(seed: int, n: int, _: dict) -> tuple[float, float]:
-    found = ibis(TOY_PRIOR, lambda theta, y: stats.norm.logpdf(y, theta["mu"], theta["sigma"]), TOY, n, seed)
+    found = ibis(TOY_PRIOR, lambda theta, y: Normal(theta["mu"], theta["sigma"]).log_prob(y), TOY, n, seed)
     return found.log_evidence, float(found.mean["mu"])
 
 

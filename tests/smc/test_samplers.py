@@ -259,6 +259,13 @@ def test_what_is_refused():
         ibis(Normal(), lambda x, y: -(x**2), [], 10)
     with pytest.raises(InputError, match="log_likelihood has the parameters"):
         ibis(Normal(), lambda x: -(x**2), [1.0], 10)
+
+    def mixes(theta):
+        sd = 0.5 + abs(np.mean(theta["rho"]))
+        return bootstrap(StateSpaceModel.of(Normal(), lambda x: Normal(x, 1.0), lambda x: Normal(x, float(sd))), 10)
+
+    with pytest.raises(InputError, match="with one parameter vector for each particle is not that of single filters"):
+        smc2(mixes, YS, PRIOR, 10, batched=True)
     with pytest.raises(InputError, match="the result of filter_of is StateSpaceModel"):
         smc2(model_of, YS, PRIOR, 10)
 

@@ -251,6 +251,11 @@ class _Sequential(Target):
 
     log_likelihood: Callable[..., np.ndarray]
 
+    @cached_property
+    def names(self) -> dict[str, bool]:
+        """Which of ``t`` and ``u`` the function takes."""
+        return step_parameters(self.log_likelihood, 2)
+
     def evaluate(self, rng: np.random.Generator, theta: Any, n: int, data: Any, like: Rows) -> Rows:
         return {LOG_LIKELIHOOD: sum((self._of_step(theta, n, t, y) for t, y in enumerate(data)), np.zeros(n))}
 
@@ -264,7 +269,7 @@ class _Sequential(Target):
         y, u = split_input(observation)
         if y is None:
             return np.zeros(n)
-        bound = bind_step(self.log_likelihood, step_parameters(self.log_likelihood, 2), t, u)
+        bound = bind_step(self.log_likelihood, self.names, t, u) if self.names else self.log_likelihood
         return checked_densities("log likelihood", bound(theta, y), n)
 
 

@@ -35,9 +35,9 @@ from mstfilter.smc.components import EssBelow
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.first_steps import unexamined
 from mstfilter.smc.inference.samplers import LOG_LIKELIHOOD, Rows, Sampled, Sampler, Target
-from mstfilter.smc.inputs import check_observations
+from mstfilter.smc.inputs import check_observations, split_input
 from mstfilter.smc.interfaces import Resampler, Trigger
-from mstfilter.smc.population import Particles, Population, log_mean_exp, take
+from mstfilter.smc.population import Particles, Population, log_mean_exp, take, union
 from mstfilter.smc.resampling import Systematic
 from mstfilter.smc.streams import Key
 from mstfilter.smc.sweep import advance_runs, can_sweep
@@ -198,6 +198,32 @@ class _Swept(_Filters):
 
     def size(self, rows: Mapping[str, np.ndarray]) -> int | None:
         return rows[_WEIGHTS].shape[1] if _WEIGHTS in rows else None
+
+    def extend(
+        self, rng: np.random.Generator, theta: Any, population: Population, data: Any
+    ) -> tuple[Rows, np.ndarray]:
+        if len(data) == 1 and len(population) > 1:
+            with suppress(LostRunError):
+                self._compare(theta, data[0])
+        return super().extend(rng, theta, population, data)
+
+    def _compare(self, theta: Any, observation: Any) -> None:
+        """Raise InputError unless the likelihood of two parameter vectors together is that of each alone."""
+        y, u = split_input(observation)
+        alone: list[Any] = [self.made(_one(theta, i), None).at_step(0, u) for i in range(2)]
+        n = alone[0].n
+        both: Any = self.made(_repeated(theta, np.arange(2), n), None).at_step(0, u)
+        if y is None or both.update is None:
+            return
+        drawn = [one.initial.sample(Key(i).generator(), y, n) for i, one in enumerate(alone)]
+        found = [one.update.update(Key(0).generator(), x, None, y) for one, x in zip(alone, drawn, strict=True)]
+        together = both.update.update(Key(0).generator(), union(*drawn), None, y)
+        wanted = np.concatenate([one.log_weights for one in found])
+        if not np.allclose(together.log_weights, wanted, rtol=1e-6, atol=1e-6):
+            raise InputError(
+                "the likelihood with one parameter vector for each particle is not that of single filters",
+                "with batched=True, filter_of gets arrays of one parameter per particle: use them like particles",
+            )
 
     def stepper(self, theta: Any, n: int, size: int | None) -> Callable[..., Rows]:
         first = self.made(_one(theta, 0), size)
