@@ -33,12 +33,8 @@ from mstfilter.scene.frame import (
     grey_blocks as grey_blocks,
 )
 from mstfilter.scene.geometry import (
-    BASELINE as BASELINE,
-    TABLE_TOLERANCE as TABLE_TOLERANCE,
-    fit_support_plane as fit_support_plane,
     frame_geometry as frame_geometry,
     frame_points as frame_points,
-    table_residual as table_residual,
 )
 from mstfilter.scene.occupancy import Occupancy as Occupancy
 from mstfilter.scene.partitions import (
@@ -47,6 +43,12 @@ from mstfilter.scene.partitions import (
     common_refinement as common_refinement,
 )
 from mstfilter.scene.pauses import PauseRule as PauseRule, pauses_with_depth as pauses_with_depth
+from mstfilter.scene.planes import (
+    BASELINE as BASELINE,
+    TABLE_TOLERANCE as TABLE_TOLERANCE,
+    fit_support_plane as fit_support_plane,
+    table_residual as table_residual,
+)
 from mstfilter.scene.plausibility import (
     Finding as Finding,
     Look as Look,

@@ -22,7 +22,7 @@ from mstfilter.scene.alignment import MIN_MOVED, Corners, Edges, edge_agreement
 from mstfilter.scene.arrays import content_key
 from mstfilter.scene.camera import Camera
 from mstfilter.scene.frame import Frame, depth_sigma
-from mstfilter.scene.geometry import ON_TABLE, Plane, plane_of, sampled, table_of
+from mstfilter.scene.planes import ON_TABLE, Plane, plane_of, sampled, table_of
 from mstfilter.scene.voxels import VoxelGrid
 
 _FIELDS, _POSSIBLE_FIELDS = (12.0, 130.0), (3.0, 160.0)  # degrees: horizontal field of view; warning and stop
@@ -188,14 +188,14 @@ def _pose(first: Look) -> Iterator[Finding]:
     elif table is None and free is not None and (first.on_table.mean() < _MIN_ON_TABLE or free.tilt > 150):
         text = f"the largest plane is tilted by {free.tilt:.0f} degrees and at z = {free.height:.3f} m"
         yield Finding(True, f"no table is at z = 0: {text}, expected z = 0", hints)
-    else:
+    elif free is None or free.tilt > 2 * _MAX_TILT or abs(free.height) > 2 * _MAX_HEIGHT:
         yield from _other_support(first)
 
 
 def _other_support(first: Look) -> Iterator[Finding]:
-    """Findings if a wall or the floor is at z = 0, because a pose was found there, and another plane is the table.
+    """Findings if a wall or the floor is at z = 0, and another plane is the table.
 
-    A table is parallel to the floor, and its height above the floor is larger than the height of an object. A table
+    The table of the depth image, found without the pose, is then not at z = 0 either. A table is parallel to the floor, and its height above the floor is larger than the height of an object. A table
     is at a right angle to a wall and extends far from the wall. In the image, the normal of a table points up, and
     the normal of a wall does not.
     """

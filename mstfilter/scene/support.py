@@ -27,7 +27,7 @@ from mstfilter.scene.arrays import read_only
 from mstfilter.scene.cache import memo
 from mstfilter.scene.camera import Camera, scaled_area, scaled_length
 from mstfilter.scene.frame import Frame
-from mstfilter.scene.geometry import BASELINE, TABLE_TOLERANCE, fit_support_plane, table_residual
+from mstfilter.scene.planes import BASELINE, TABLE_TOLERANCE, fit_support_plane, table_residual
 from mstfilter.scene.voxels import VoxelGrid
 
 # Areas and lengths are those of an image of 640 x 480 pixels.
