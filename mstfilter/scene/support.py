@@ -31,6 +31,11 @@ from mstfilter.scene.planes import BASELINE, TABLE_TOLERANCE, fit_support_plane,
 from mstfilter.scene.voxels import VoxelGrid
 
 # Areas and lengths are those of an image of 640 x 480 pixels.
+_NOISE_REACH = 40.0  # standard deviation of the surroundings that show the noise of the table, pixels
+_NEAR_MEAN = 3.0  # in units of noise: readings farther from the mean of the table are not of the table
+_DEEPEST = 20.0  # sensor units: readings farther below are not of the table
+_FEW_READINGS = 0.01  # share of readings of the table around a pixel, with fewer those of the whole table count
+_ROUNDS = 3
 _DENSE = 0.8  # share of readings beside a reading: with less, depth has holes everywhere
 _FEW_BESIDE = 0.1  # share of readings around a reading: with less, the reading is noise
 _SMALLEST = 25  # pixels of a region of readings
@@ -52,7 +57,8 @@ _NARROW = 6.0  # pixels between a reading and an estimate that is this reading
 _FEW = 10  # readings of an object that do not determine the depth of its other pixels
 _STANDS = 0.004  # metres: least height of estimated readings above the table, without a grid
 _LAYER = 0.75  # the same in voxels of the grid: at least one layer of voxel centres lies inside a flat object
-_LOW, _SMALL = 6.0, 500  # mean rise in sensor units, and pixels, of noise with the colour of the table
+_LOW = 6.0  # rise of noise with the colour of the table, in units of noise
+_SMEARED = 20.0  # rise of readings between an object and the table, in units of noise
 _SAME_COLOUR, _OTHER_COLOUR = 2.0, 0.25  # squared distance of the colour of the table; share of pixels above it
 _OUTLINE = 6.0  # pixels on both sides of an outline that are assigned by colour
 _CORE = 2.0  # pixels between an outline and the core of an object
@@ -81,7 +87,10 @@ def above_table(frame: Frame) -> np.ndarray:
 
 def filled_above_table(frame: Frame) -> np.ndarray:
     """The values of `above_table`. For a sparse sensor, missing pixels take the value of the nearest reading."""
-    height = above_table(frame)
+    return _filled(frame, above_table(frame))
+
+
+def _filled(frame: Frame, height: np.ndarray) -> np.ndarray:
     beside = cv2.blur(frame.valid.astype(np.float32), (3, 3))[frame.valid]
     return fill_from_nearest(height, ~frame.valid) if len(beside) and beside.mean() < _DENSE else height
 
@@ -104,6 +113,44 @@ def pixels_above_table(frame: Frame) -> np.ndarray:
     """Pixels (H, W) that have a reading above the table and do not show the robot."""
     with np.errstate(invalid="ignore"):
         return frame.valid & (above_table(frame) > TABLE_TOLERANCE)
+
+
+def height_in_noise(frame: Frame) -> np.ndarray:
+    """The values of `above_table` in units of the noise of this sensor at this place, (H, W) float32.
+
+    Nothing is below a table, so the readings below show the noise, and a table that bends down. Mean and standard
+    deviation of the readings of the table are computed around each pixel, without readings that are far above. The
+    mean is subtracted where it is negative. One unit is the standard deviation divided by that of a Kinect, which
+    is about one sensor unit, and at least one sensor unit. The result is cached.
+    """
+    return memo("height_in_noise", frame.key, lambda: read_only(_height_in_noise(frame)))
+
+
+def _height_in_noise(frame: Frame) -> np.ndarray:
+    height = above_table(frame)
+    with np.errstate(invalid="ignore"):
+        below = frame.valid & (height > -_DEEPEST) & (height < 0)
+    if not below.any():
+        return height
+    typical = max(1.0, -float(np.median(height[below])) / 0.6745)  # the median of |x| for a normal x is .6745
+    mean, noise = np.zeros_like(height), np.full_like(height, typical)
+    for _ in range(_ROUNDS):
+        with np.errstate(invalid="ignore"):
+            off = np.where(frame.valid, height - mean, np.nan)
+            table = (np.abs(off) < _NEAR_MEAN * noise) & (height > -_DEEPEST)
+            mean = np.minimum(mean + _mean_around(off, table), 0)
+            off = np.where(frame.valid, height - mean, np.nan)
+            below = (off < 0) & (off > -_NEAR_MEAN * noise) & (height > -_DEEPEST)
+        noise = np.sqrt(np.maximum(_mean_around(off**2, below), 1))
+    return ((height - mean) / noise).astype(np.float32)
+
+
+def _mean_around(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Mean (H, W) of an image at the `pixels` (H, W) bool around each pixel; where these are few, of all of them."""
+    own = np.where(pixels, image, 0).astype(np.float32)
+    few = _FEW_READINGS / max(int(pixels.sum()), 1)
+    share = _surroundings(pixels.astype(np.float32), _NOISE_REACH) + _FEW_READINGS
+    return (_surroundings(own, _NOISE_REACH) + few * float(own.sum(dtype=np.float64))) / share
 
 
 def readings_above_table(frame: Frame, grid: VoxelGrid | None = None) -> np.ndarray:
@@ -175,8 +222,11 @@ def _regions_of_readings(frame: Frame, grid: VoxelGrid | None, seen: _Colours) -
 
     A small and low region with the colour of the table is noise.
     """
-    raised = readings_above_table(frame, grid)
-    height = np.minimum(np.nan_to_num(filled_above_table(frame), posinf=1e3), 1e3)
+    other = seen.distance > _COLOUR_DISTANCE
+    height = np.where(other, filled_above_table(frame), _filled(frame, height_in_noise(frame)))
+    height = np.minimum(np.nan_to_num(height, posinf=1e3), 1e3)
+    raised = readings_above_table(frame, grid) & (height > TABLE_TOLERANCE)
+    raised &= ~_doubtful(frame, raised, height, seen)
     solid = raised | (~frame.valid & (height > TABLE_TOLERANCE))
     core = cv2.morphologyEx(solid.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     regions, _ = ndimage.label(core)
@@ -185,9 +235,34 @@ def _regions_of_readings(frame: Frame, grid: VoxelGrid | None, seen: _Colours) -
         for values in (np.ones(core.shape), height, seen.distance > _SAME_COLOUR)
     )
     kept = (area >= scaled_area(_SMALLEST, raised.size)) & (rise > _RISE * TABLE_TOLERANCE * area)
-    kept &= (other > _OTHER_COLOUR * area) | (rise >= _LOW * area) | (area >= scaled_area(_SMALL, raised.size))
+    kept &= (other > _OTHER_COLOUR * area) | (rise >= _LOW * area)
     kept[0] = False
     return (cv2.dilate(kept[regions].astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & raised
+
+
+def _doubtful(frame: Frame, raised: np.ndarray, height: np.ndarray, seen: _Colours) -> np.ndarray:
+    """Pixels (H, W) bool of low `raised` readings that have the colour of the table and not that of an object.
+
+    Around objects, sensors smear the depth into the table; glare, cloth, and the end of a table rise too. The colours
+    of the nearby higher readings decide. Without any nearby, a low reading with the colour of the table is doubtful.
+    A low region that higher readings enclose is the inside of a plate.
+    """
+    width = frame.camera.width
+    low = raised & (height < _SMEARED)
+    high = (raised & ~low).astype(np.uint8)
+    core = cv2.erode(high, _ellipse(scaled_length(_CORE, width))) > 0
+    share, mean, variance = _around(seen.lab, core, _CORE_REACH)
+    distance = ((seen.lab - mean) ** 2 / variance).sum(axis=-1)
+    log_ratio = 0.5 * (seen.distance + seen.log_variance - distance - np.log(variance).sum(axis=-1))
+    beside = (share > _FEW_NEAR) & (seen.distance < _COLOUR_DISTANCE) & (-log_ratio > _DOUBT * height)
+    found = low & np.where(share > _FEW_NEAR, beside, (height < _LOW) & (seen.distance < _LIKE_TABLE))
+    found = _opened(found, 1)
+    kept = raised & ~found
+    return found & ~_enclosed(found, kept, frame.valid, _PLATE)
+
+
+_LIKE_TABLE = 3.0
+_DOUBT, _PLATE = 0.4, 0.7
 
 
 def _on_table(frame: Frame) -> np.ndarray:
