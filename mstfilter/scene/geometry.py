@@ -14,7 +14,8 @@ from mstfilter.base.errors import InputError, check_number
 from mstfilter.scene.arrays import read_only
 from mstfilter.scene.cache import memo
 from mstfilter.scene.camera import Camera
-from mstfilter.scene.frame import Frame, depth_sigma
+from mstfilter.scene.frame import Frame
+from mstfilter.scene.planes import without_strips
 from mstfilter.scene.voxels import VoxelGrid
 
 
@@ -77,8 +78,6 @@ def in_columns(grid: VoxelGrid, points: np.ndarray) -> np.ndarray:
 
 _MIN_HEIGHT = 0.01  # metres above the table beyond which a reading may show an object
 
-_CELL, _STRIP = 0.1, 0.02  # metres: gap between a table and another surface; standard deviation across a strip
-_FAR = 10.0  # metres from the camera, beyond which no table is expected
 _BORDER = 0.03  # metres: a wall may stand at the border of the visible table
 _MARGIN = 0.05  # metres of the workspace around the visible table
 _LEAST_SIDE, _LARGEST_SIDE, _HEIGHT = 1.0, 2.0, 0.5  # metres
@@ -93,7 +92,7 @@ def workspace(frame: Frame, voxel_size: float = 0.01) -> VoxelGrid:
     """
     check_number("voxel size", voxel_size, above=0, at_most=0.5, unit="number of metres")
     points = frame.points[frame.valid]
-    table = _without_strips(points[np.abs(points[:, 2]) < _MIN_HEIGHT, :2], frame.camera.position[:2])
+    table = without_strips(points[np.abs(points[:, 2]) < _MIN_HEIGHT, :2], frame.camera.position[:2])
     raised = points[(points[:, 2] > _MIN_HEIGHT) & (points[:, 2] < _HEIGHT), :2]
     if len(table):
         low, high = np.percentile(table, (1, 99), axis=0)
@@ -112,28 +111,3 @@ def workspace(frame: Frame, voxel_size: float = 0.01) -> VoxelGrid:
     centre = np.clip(np.percentile(chosen, (2, 98), axis=0).mean(axis=0), *reach)
     origin = np.append(np.round((centre - side / 2) / voxel_size) * voxel_size, 0.0)
     return VoxelGrid(origin, voxel_size, (*map(round, side / voxel_size), round(_HEIGHT / voxel_size)))
-
-
-def _without_strips(points: np.ndarray, camera: np.ndarray) -> np.ndarray:
-    """Table readings (N, 2) without those of a wall behind the table, which form a thin separate strip at z = 0.
-
-    `camera` (2,) is the position of the camera in the plane of the table.
-    """
-    from scipy import ndimage
-
-    near = points[np.linalg.norm(points - camera, axis=1) < _FAR]
-    if not len(near):
-        return points
-    cell = np.floor((near - near.min(axis=0)) / _CELL).astype(np.int64)
-    occupied = np.zeros(cell.max(axis=0) + 1, bool)
-    occupied[tuple(cell.T)] = True
-    group = ndimage.label(occupied, np.ones((3, 3)))[0][tuple(cell.T)] - 1
-    n = np.bincount(group)
-    mean = np.stack([np.bincount(group, axis) / n for axis in near.T], axis=1)
-    x, y = (near - mean[group]).T
-    xx, yy, xy = (np.bincount(group, product) / n for product in (x * x, y * y, x * y))
-    across = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)  # the smaller eigenvalue of the covariance
-    noise = 2 * depth_sigma(np.linalg.norm(mean - camera, axis=1))
-    keep = (n >= 3) & (across > np.maximum(_STRIP, noise) ** 2)
-    keep[n.argmax()] = True
-    return near[keep[group]]

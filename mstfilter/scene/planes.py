@@ -28,7 +28,7 @@ from mstfilter.base.errors import InputError
 from mstfilter.scene.arrays import read_only
 from mstfilter.scene.cache import memo
 from mstfilter.scene.camera import Camera
-from mstfilter.scene.frame import Frame
+from mstfilter.scene.frame import Frame, depth_sigma
 
 BASELINE = 0.075  # metres between projector and camera of a Kinect v1; sets the unit of disparity
 _FOCAL = 525.0  # focal length of a Kinect v1 in pixels; sets the unit of disparity only
@@ -129,6 +129,14 @@ _IN_FRONT = 0.025  # metres: readings farther in front of a plane are not on it
 _TALL = 0.35  # metres: objects are not higher; the table is higher above the floor, and extends farther from a wall
 _PARALLEL, _RIGHT = 15.0, 60.0  # degrees between the normals of parallel planes, and of planes at a right angle
 _MORE_UPRIGHT = 0.4  # difference of the upward parts of the normals of a table and of a wall, in the image
+_ON_TABLE = 0.01  # metres
+_FEW_ON_TABLE = 100  # readings of the table in the reduced image
+_BESIDE_TABLE = 0.1  # metres beyond the readings of the table, where an object can still stand
+_AT_WALL = 0.02  # metres
+_UPRIGHT = 75.0  # degrees between the normals of a wall and of the table
+_LEAST_WALL = 0.02  # share of the readings
+_FEW_BEHIND = 0.02  # share of the readings of the table behind a wall
+_AT_RIM = 0.5  # pixels of a wall at the end of the image, relative to the root of its area
 _STANDING = 0.01  # share of the readings that are things on the table
 
 
@@ -239,6 +247,69 @@ def _standing(plane: _Found, points: np.ndarray) -> float:
     return float((over & (height > _IN_FRONT / 2) & (height < _TALL)).mean())
 
 
+def beyond_table(frame: Frame) -> np.ndarray:
+    """Pixels (H, W) bool with readings of walls, or of other things that do not stand on the table at z = 0.
+
+    A wall is an upright plane that bounds the table, and either is higher than objects are or extends beyond the
+    image. Things beside the table are outside the convex hull of the readings of the table. The result is cached.
+    """
+    return memo("beyond_table", frame.key, lambda: read_only(_beyond(frame)))
+
+
+def _beyond(frame: Frame) -> np.ndarray:
+    small = sampled(frame, _COLUMNS)
+    points = small.points[small.valid]
+    table = without_strips(points[np.abs(points[:, 2]) < _ON_TABLE, :2], small.camera.position[:2])
+    if len(table) < _FEW_ON_TABLE:
+        return np.zeros(frame.valid.shape, bool)
+    found = np.zeros(frame.valid.shape, bool)
+    with np.errstate(invalid="ignore"):
+        found[frame.valid] = _outside(frame.points[frame.valid], table)
+        for plane in _walls(small, table):
+            rays = frame.camera.rays()
+            distance = (_SCALE - frame.depth * (rays @ plane.q)) / np.linalg.norm(plane.q)
+            found |= frame.valid & (distance < _AT_WALL + 2 * depth_sigma(frame.depth)) & (frame.points[..., 2] > 0)
+    return found
+
+
+def _outside(points: np.ndarray, table: np.ndarray) -> np.ndarray:
+    """Whether points (n, 3) are outside the convex hull of readings (m, 2) of the table, by more than a margin."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        normal, offset = np.split(ConvexHull(table).equations, [2], axis=1)
+    except QhullError:
+        return np.zeros(len(points), bool)
+    return np.asarray((points[:, :2] @ normal.T + offset[:, 0] > _BESIDE_TABLE).any(axis=1))
+
+
+def _walls(frame: Frame, table: np.ndarray) -> Iterator[_Found]:
+    """The walls of a small image. `table` (m, 2) are the readings of the table in world axes."""
+    height, up = frame.points[..., 2], frame.camera.pose.rotation.inv().apply([0.0, 0.0, 1.0])
+    with np.errstate(invalid="ignore"):
+        raised = frame.valid & (height > _IN_FRONT)
+    if raised.sum() < _LEAST_WALL * frame.valid.sum():
+        return
+    rim = ~_inner(frame.valid)[raised]
+    ground = frame.camera.pose.inv().apply(np.column_stack([table, np.zeros(len(table))]))
+    for plane in _planes(frame.camera.rays(), _disparity_of(frame), raised):
+        own = height[raised][plane.inliers]
+        area = int(plane.inliers.sum())
+        upright = abs(plane.up @ up) < np.cos(np.radians(_UPRIGHT)) and area > _LEAST_WALL * frame.valid.sum()
+        if upright and (plane.above(ground) < -_AT_WALL).mean() < _FEW_BEHIND:
+            at_rim = int((rim & plane.inliers).sum())
+            if np.percentile(own, 98) > _TALL or at_rim > _AT_RIM * np.sqrt(area):
+                yield plane
+
+
+def _inner(valid: np.ndarray) -> np.ndarray:
+    """Pixels (h, w) bool that are not at the left, right or upper end of the readings of an image."""
+    inner = valid.copy()
+    columns, rows = np.flatnonzero(valid.any(axis=0)), np.flatnonzero(valid.any(axis=1))
+    inner[: rows[0] + 3] = inner[:, : columns[0] + 3] = inner[:, columns[-1] - 2 :] = False
+    return inner
+
+
 def _pose(camera: Camera, plane: np.ndarray, pixels: np.ndarray) -> RigidTransform:
     """Camera pose in world axes with z up and the plane at z = 0. `plane` is (a, b, c) of disparity a u + b v + c."""
     # D = p . (u, v, 1) and (u, v, 1) = K X / z  =>  8 f b = p K X: the plane in camera axes.
@@ -344,3 +415,32 @@ def table_residual(frame: Frame) -> np.ndarray:
         return read_only(residual.astype(np.float32))
 
     return memo("table_residual", frame.key, compute)
+
+
+_CELL, _STRIP = 0.1, 0.02  # metres: gap between a table and another surface; standard deviation across a strip
+_FAR = 10.0  # metres from the camera, beyond which no table is expected
+
+
+def without_strips(points: np.ndarray, camera: np.ndarray) -> np.ndarray:
+    """Table readings (N, 2) without those of a wall behind the table, which form a thin separate strip at z = 0.
+
+    `camera` (2,) is the position of the camera in the plane of the table.
+    """
+    from scipy import ndimage
+
+    near = points[np.linalg.norm(points - camera, axis=1) < _FAR]
+    if not len(near):
+        return points
+    cell = np.floor((near - near.min(axis=0)) / _CELL).astype(np.int64)
+    occupied = np.zeros(cell.max(axis=0) + 1, bool)
+    occupied[tuple(cell.T)] = True
+    group = ndimage.label(occupied, np.ones((3, 3)))[0][tuple(cell.T)] - 1
+    n = np.bincount(group)
+    mean = np.stack([np.bincount(group, axis) / n for axis in near.T], axis=1)
+    x, y = (near - mean[group]).T
+    xx, yy, xy = (np.bincount(group, product) / n for product in (x * x, y * y, x * y))
+    across = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)  # the smaller eigenvalue of the covariance
+    noise = 2 * depth_sigma(np.linalg.norm(mean - camera, axis=1))
+    keep = (n >= 3) & (across > np.maximum(_STRIP, noise) ** 2)
+    keep[n.argmax()] = True
+    return near[keep[group]]

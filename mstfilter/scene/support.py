@@ -27,14 +27,14 @@ from mstfilter.scene.arrays import read_only
 from mstfilter.scene.cache import memo
 from mstfilter.scene.camera import Camera, scaled_area, scaled_length
 from mstfilter.scene.frame import Frame
-from mstfilter.scene.planes import BASELINE, TABLE_TOLERANCE, fit_support_plane, table_residual
+from mstfilter.scene.planes import BASELINE, TABLE_TOLERANCE, beyond_table, fit_support_plane, table_residual
 from mstfilter.scene.voxels import VoxelGrid
 
 # Areas and lengths are those of an image of 640 x 480 pixels.
 _NOISE_REACH = 40.0  # standard deviation of the surroundings that show the noise of the table, pixels
 _NEAR_MEAN = 3.0  # in units of noise: readings farther from the mean of the table are not of the table
 _DEEPEST = 20.0  # sensor units: readings farther below are not of the table
-_FEW_READINGS = 0.01  # share of readings of the table around a pixel, with fewer those of the whole table count
+_FEW_READINGS = 0.1  # share of readings of the table around a pixel at which those of the whole table count as much
 _ROUNDS = 3
 _DENSE = 0.8  # share of readings beside a reading: with less, depth has holes everywhere
 _FEW_BESIDE = 0.1  # share of readings around a reading: with less, the reading is noise
@@ -141,7 +141,7 @@ def _height_in_noise(frame: Frame) -> np.ndarray:
             mean = np.minimum(mean + _mean_around(off, table), 0)
             off = np.where(frame.valid, height - mean, np.nan)
             below = (off < 0) & (off > -_NEAR_MEAN * noise) & (height > -_DEEPEST)
-        noise = np.sqrt(np.maximum(_mean_around(off**2, below), 1))
+        noise = np.sqrt(np.maximum(_mean_around(off**2, below) / 1.5625, 1))
     return ((height - mean) / noise).astype(np.float32)
 
 
@@ -225,7 +225,7 @@ def _regions_of_readings(frame: Frame, grid: VoxelGrid | None, seen: _Colours) -
     other = seen.distance > _COLOUR_DISTANCE
     height = np.where(other, filled_above_table(frame), _filled(frame, height_in_noise(frame)))
     height = np.minimum(np.nan_to_num(height, posinf=1e3), 1e3)
-    raised = readings_above_table(frame, grid) & (height > TABLE_TOLERANCE)
+    raised = readings_above_table(frame, grid) & (height > TABLE_TOLERANCE) & ~beyond_table(frame)
     raised &= ~_doubtful(frame, raised, height, seen)
     solid = raised | (~frame.valid & (height > TABLE_TOLERANCE))
     core = cv2.morphologyEx(solid.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
@@ -254,14 +254,14 @@ def _doubtful(frame: Frame, raised: np.ndarray, height: np.ndarray, seen: _Colou
     share, mean, variance = _around(seen.lab, core, _CORE_REACH)
     distance = ((seen.lab - mean) ** 2 / variance).sum(axis=-1)
     log_ratio = 0.5 * (seen.distance + seen.log_variance - distance - np.log(variance).sum(axis=-1))
-    beside = (share > _FEW_NEAR) & (seen.distance < _COLOUR_DISTANCE) & (-log_ratio > _DOUBT * height)
+    beside = (share > _FEW_NEAR) & (seen.distance < _SHADED) & (-log_ratio > _DOUBT * height)
     found = low & np.where(share > _FEW_NEAR, beside, (height < _LOW) & (seen.distance < _LIKE_TABLE))
     found = _opened(found, 1)
     kept = raised & ~found
     return found & ~_enclosed(found, kept, frame.valid, _PLATE)
 
 
-_LIKE_TABLE = 3.0
+_LIKE_TABLE, _SHADED = 3.0, 6.0
 _DOUBT, _PLATE = 0.4, 0.7
 
 
