@@ -16,7 +16,7 @@ z of the world points up, and the table is at z = 0. This room depends neither o
 =====================================  ===============================================================
 `camera`, `frame`, `recording`         pinhole cameras; images, clips; videos with pauses
 `voxels`, `occupancy`, `partitions`    grids and hypotheses; probabilities; renumbered and refined labels
-`planes`, `support`                    the table and walls; which pixels belong to objects
+`planes`, `heights`, `support`         the table and walls; readings above it; which pixels belong to objects
 `geometry`                             voxels in the image, the workspace
 `rendering`, `evidence`                hypotheses seen by a camera; free space, scores
 `plausibility`                         faults of the input, found before a run

@@ -36,6 +36,14 @@ from mstfilter.scene.geometry import (
     frame_geometry as frame_geometry,
     frame_points as frame_points,
 )
+from mstfilter.scene.heights import (
+    above_table as above_table,
+    fill_from_nearest as fill_from_nearest,
+    filled_above_table as filled_above_table,
+    pixels_above_table as pixels_above_table,
+    posed_camera as posed_camera,
+    readings_above_table as readings_above_table,
+)
 from mstfilter.scene.occupancy import Occupancy as Occupancy
 from mstfilter.scene.partitions import (
     CommonRefinement as CommonRefinement,
@@ -69,17 +77,7 @@ from mstfilter.scene.rendering import (
     render as render,
     render_hypothesis as render_hypothesis,
 )
-from mstfilter.scene.support import (
-    Foreground as Foreground,
-    above_table as above_table,
-    fill_from_nearest as fill_from_nearest,
-    filled_above_table as filled_above_table,
-    foreground as foreground,
-    pixel_graph as pixel_graph,
-    pixels_above_table as pixels_above_table,
-    posed_camera as posed_camera,
-    readings_above_table as readings_above_table,
-)
+from mstfilter.scene.support import Foreground as Foreground, foreground as foreground, pixel_graph as pixel_graph
 from mstfilter.scene.voxels import (
     MAX_LABEL as MAX_LABEL,
     Crop as Crop,

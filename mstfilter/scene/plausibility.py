@@ -195,9 +195,9 @@ def _pose(first: Look) -> Iterator[Finding]:
 def _other_support(first: Look) -> Iterator[Finding]:
     """Findings if a wall or the floor is at z = 0, and another plane is the table.
 
-    The table of the depth image, found without the pose, is then not at z = 0 either. A table is parallel to the floor, and its height above the floor is larger than the height of an object. A table
-    is at a right angle to a wall and extends far from the wall. In the image, the normal of a table points up, and
-    the normal of a wall does not.
+    The table of the depth image, found without the pose, is then not at z = 0 either. A table is parallel to the
+    floor, and its height above the floor is larger than the height of an object. A table is at a right angle to a
+    wall and extends far from the wall. In the image, the normal of a table points up, and that of a wall does not.
     """
     raised = first.points[:, 2] > ON_TABLE
     plane = plane_of(first.frame, raised) if raised.mean() > _MIN_ON_TABLE else None

@@ -4,12 +4,14 @@
 >>> found.pixels                        # (H, W) bool, may belong to an object
 >>> found.frame.depth                   # metres, estimated where a pixel of an object has no reading of it
 
-Pixels with a depth reading are classified by depth. Isolated readings above the table are noise, and so are small
-and low regions with the colour of the table. Other connected regions of readings are objects. Dark or shiny surfaces
+Pixels with a depth reading are classified by depth (`mstfilter.scene.heights`). Isolated readings above the table are
+noise, and so are low readings with the colour of the table: cloth, glare, and the depth that sensors smear from an
+object into the table. Walls and things beside the table are no objects. Other connected regions of readings are
+objects. Dark or shiny surfaces
 often have no readings. A pixel without a reading belongs to an object if its colour differs from the nearby table.
 Near the outline of an object, depth images have errors of several pixels. There, the colours of the object and of the
 table decide. A region of another colour with readings on the table is a flat object if it is higher than the table
-around it. The table is the plane z = 0 if the camera has a pose, else the plane with the most depth readings.
+around it.
 """
 
 from __future__ import annotations
@@ -25,18 +27,21 @@ from scipy.sparse.linalg import spsolve
 
 from mstfilter.scene.arrays import read_only
 from mstfilter.scene.cache import memo
-from mstfilter.scene.camera import Camera, scaled_area, scaled_length
+from mstfilter.scene.camera import scaled_area, scaled_length
 from mstfilter.scene.frame import Frame
-from mstfilter.scene.planes import BASELINE, TABLE_TOLERANCE, beyond_table, fit_support_plane, table_residual
+from mstfilter.scene.heights import (
+    above_table,
+    filled_above_table,
+    height_in_noise,
+    pixels_above_table,
+    posed_camera,
+    readings_above_table,
+    surroundings,
+)
+from mstfilter.scene.planes import BASELINE, TABLE_TOLERANCE, beyond_table
 from mstfilter.scene.voxels import VoxelGrid
 
 # Areas and lengths are those of an image of 640 x 480 pixels.
-_NOISE_REACH = 40.0  # standard deviation of the surroundings that show the noise of the table, pixels
-_NEAR_MEAN = 3.0  # in units of noise: readings farther from the mean of the table are not of the table
-_DEEPEST = 20.0  # sensor units: readings farther below are not of the table
-_FEW_READINGS = 0.1  # share of readings of the table around a pixel at which those of the whole table count as much
-_ROUNDS = 3
-_DENSE = 0.8  # share of readings beside a reading: with less, depth has holes everywhere
 _FEW_BESIDE = 0.1  # share of readings around a reading: with less, the reading is noise
 _SMALLEST = 25  # pixels of a region of readings
 _RISE = 1.75  # mean rise of a region of readings, in tolerances
@@ -51,14 +56,17 @@ _HOLE = 0.9  # share of the readings around a hole in an object that are reading
 _SOLID, _GLARE = 8.0, 2.0  # radius of a solid gap, pixels; brightness of glare in standard deviations of the table
 _STEP, _SHADOW = 0.02, 1.2  # smallest step of depth in metres; tolerance of the width of a shadow
 _EDGE = 9  # pixels around the end of a gap that may have cast a shadow
-_FINE = 20.0  # pixels: means over less than this are computed at half of the resolution, others at a quarter
 _FEW_NEAR = 1e-3  # share of the core of objects around a pixel that shows their colours
+_TOUCHING = 0.02  # the same, at about 20 pixels from the core, within which depth is smeared
 _NARROW = 6.0  # pixels between a reading and an estimate that is this reading
 _FEW = 10  # readings of an object that do not determine the depth of its other pixels
 _STANDS = 0.004  # metres: least height of estimated readings above the table, without a grid
 _LAYER = 0.75  # the same in voxels of the grid: at least one layer of voxel centres lies inside a flat object
 _LOW = 6.0  # rise of noise with the colour of the table, in units of noise
-_SMEARED = 20.0  # rise of readings between an object and the table, in units of noise
+_LIKE_TABLE = 3.0  # squared distance of such a colour
+# The same beside an object: rise, squared distance of colour, least log odds of the table per unit of noise.
+_SMEARED, _SHADED, _DOUBT = 20.0, 6.0, 0.4
+_PLATE = 0.7  # share of the readings around the inside of a plate that are higher
 _SAME_COLOUR, _OTHER_COLOUR = 2.0, 0.25  # squared distance of the colour of the table; share of pixels above it
 _OUTLINE = 6.0  # pixels on both sides of an outline that are assigned by colour
 _CORE = 2.0  # pixels between an outline and the core of an object
@@ -75,88 +83,6 @@ class Foreground:
 
     pixels: np.ndarray  #: (H, W) bool
     frame: Frame  #: the frame, with estimated depth at pixels without a reading of the object
-
-
-def above_table(frame: Frame) -> np.ndarray:
-    """Disparity minus the disparity of the table, (H, W) float32 in sensor units; NaN at pixels without a reading.
-
-    One sensor unit is 1/8 px at f = 525 px, or 3.2 mm of depth at 1 m.
-    """
-    return fit_support_plane(frame).residual if frame.camera.T_world_camera is None else table_residual(frame)
-
-
-def filled_above_table(frame: Frame) -> np.ndarray:
-    """The values of `above_table`. For a sparse sensor, missing pixels take the value of the nearest reading."""
-    return _filled(frame, above_table(frame))
-
-
-def _filled(frame: Frame, height: np.ndarray) -> np.ndarray:
-    beside = cv2.blur(frame.valid.astype(np.float32), (3, 3))[frame.valid]
-    return fill_from_nearest(height, ~frame.valid) if len(beside) and beside.mean() < _DENSE else height
-
-
-def fill_from_nearest(depth: np.ndarray, holes: np.ndarray) -> np.ndarray:
-    """Depth (H, W) in which each pixel of `holes` (H, W) bool has the depth of the nearest reading."""
-    if not holes.any() or holes.all():
-        return depth
-    rows, columns = ndimage.distance_transform_edt(holes, return_distances=False, return_indices=True)
-    return np.asarray(depth[rows, columns])
-
-
-def posed_camera(frame: Frame) -> Camera:
-    """The camera of a frame. A missing pose is computed relative to the fitted table (`fit_support_plane`)."""
-    camera = frame.camera
-    return camera if camera.T_world_camera is not None else camera.at(fit_support_plane(frame).T_world_camera)
-
-
-def pixels_above_table(frame: Frame) -> np.ndarray:
-    """Pixels (H, W) that have a reading above the table and do not show the robot."""
-    with np.errstate(invalid="ignore"):
-        return frame.valid & (above_table(frame) > TABLE_TOLERANCE)
-
-
-def height_in_noise(frame: Frame) -> np.ndarray:
-    """The values of `above_table` in units of the noise of this sensor at this place, (H, W) float32.
-
-    Nothing is below a table, so the readings below show the noise, and a table that bends down. Mean and standard
-    deviation of the readings of the table are computed around each pixel, without readings that are far above. The
-    mean is subtracted where it is negative. One unit is the standard deviation divided by that of a Kinect, which
-    is about one sensor unit, and at least one sensor unit. The result is cached.
-    """
-    return memo("height_in_noise", frame.key, lambda: read_only(_height_in_noise(frame)))
-
-
-def _height_in_noise(frame: Frame) -> np.ndarray:
-    height = above_table(frame)
-    with np.errstate(invalid="ignore"):
-        below = frame.valid & (height > -_DEEPEST) & (height < 0)
-    if not below.any():
-        return height
-    typical = max(1.0, -float(np.median(height[below])) / 0.6745)  # the median of |x| for a normal x is .6745
-    mean, noise = np.zeros_like(height), np.full_like(height, typical)
-    for _ in range(_ROUNDS):
-        with np.errstate(invalid="ignore"):
-            off = np.where(frame.valid, height - mean, np.nan)
-            table = (np.abs(off) < _NEAR_MEAN * noise) & (height > -_DEEPEST)
-            mean = np.minimum(mean + _mean_around(off, table), 0)
-            off = np.where(frame.valid, height - mean, np.nan)
-            below = (off < 0) & (off > -_NEAR_MEAN * noise) & (height > -_DEEPEST)
-        noise = np.sqrt(np.maximum(_mean_around(off**2, below) / 1.5625, 1))
-    return ((height - mean) / noise).astype(np.float32)
-
-
-def _mean_around(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Mean (H, W) of an image at the `pixels` (H, W) bool around each pixel; where these are few, of all of them."""
-    own = np.where(pixels, image, 0).astype(np.float32)
-    few = _FEW_READINGS / max(int(pixels.sum()), 1)
-    share = _surroundings(pixels.astype(np.float32), _NOISE_REACH) + _FEW_READINGS
-    return (_surroundings(own, _NOISE_REACH) + few * float(own.sum(dtype=np.float64))) / share
-
-
-def readings_above_table(frame: Frame, grid: VoxelGrid | None = None) -> np.ndarray:
-    """The `pixels_above_table` (H, W) bool with a reading in the grid. Without a grid, no pixel is excluded."""
-    pixels = pixels_above_table(frame)
-    return pixels if grid is None else pixels & grid.contains(grid.index_of(frame.points))
 
 
 def foreground(frame: Frame, grid: VoxelGrid | None = None) -> Foreground:
@@ -216,14 +142,25 @@ class _Colours:
         deviation = (lab - mean) / np.sqrt(variance)
         return cls(table, lab, near, deviation[..., 0], (deviation**2).sum(axis=-1), np.log(variance).sum(axis=-1))
 
+    def like_object(self, core: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Share (H, W) of the core (H, W) bool of objects near each pixel, and log likelihood ratio of its colours.
+
+        The ratio (H, W) is that of two normal distributions: of the nearby core and of the nearby table.
+        """
+        share, mean, variance = _around(self.lab, core, _CORE_REACH)
+        distance = ((self.lab - mean) ** 2 / variance).sum(axis=-1)
+        log_ratio = 0.5 * (self.distance + self.log_variance - distance - np.log(variance).sum(axis=-1))
+        return share, log_ratio
+
 
 def _regions_of_readings(frame: Frame, grid: VoxelGrid | None, seen: _Colours) -> np.ndarray:
     """Pixels (H, W) bool of connected regions of readings above the table, without noise.
 
-    A small and low region with the colour of the table is noise.
+    A low region with the colour of the table is noise, whatever its size. The heights of pixels of another colour are
+    in sensor units, as two kinds of evidence are enough.
     """
-    other = seen.distance > _COLOUR_DISTANCE
-    height = np.where(other, filled_above_table(frame), _filled(frame, height_in_noise(frame)))
+    coloured = seen.distance > _COLOUR_DISTANCE
+    height = np.where(coloured, filled_above_table(frame), height_in_noise(frame, filled=True))
     height = np.minimum(np.nan_to_num(height, posinf=1e3), 1e3)
     raised = readings_above_table(frame, grid) & (height > TABLE_TOLERANCE) & ~beyond_table(frame)
     raised &= ~_doubtful(frame, raised, height, seen)
@@ -247,22 +184,13 @@ def _doubtful(frame: Frame, raised: np.ndarray, height: np.ndarray, seen: _Colou
     of the nearby higher readings decide. Without any nearby, a low reading with the colour of the table is doubtful.
     A low region that higher readings enclose is the inside of a plate.
     """
-    width = frame.camera.width
     low = raised & (height < _SMEARED)
     high = (raised & ~low).astype(np.uint8)
-    core = cv2.erode(high, _ellipse(scaled_length(_CORE, width))) > 0
-    share, mean, variance = _around(seen.lab, core, _CORE_REACH)
-    distance = ((seen.lab - mean) ** 2 / variance).sum(axis=-1)
-    log_ratio = 0.5 * (seen.distance + seen.log_variance - distance - np.log(variance).sum(axis=-1))
-    beside = (share > _FEW_NEAR) & (seen.distance < _SHADED) & (-log_ratio > _DOUBT * height)
-    found = low & np.where(share > _FEW_NEAR, beside, (height < _LOW) & (seen.distance < _LIKE_TABLE))
-    found = _opened(found, 1)
-    kept = raised & ~found
-    return found & ~_enclosed(found, kept, frame.valid, _PLATE)
-
-
-_LIKE_TABLE, _SHADED = 3.0, 6.0
-_DOUBT, _PLATE = 0.4, 0.7
+    share, log_ratio = seen.like_object(cv2.erode(high, _ellipse(scaled_length(_CORE, frame.camera.width))) > 0)
+    beside = (seen.distance < _SHADED) & (-log_ratio > _DOUBT * height)
+    alone = (seen.distance < _LIKE_TABLE) & (height < _LOW)
+    found = _opened(low & np.where(share > _TOUCHING, beside, alone), 1)
+    return found & ~_enclosed(found, raised & ~found, frame.valid, _PLATE)
 
 
 def _on_table(frame: Frame) -> np.ndarray:
@@ -272,8 +200,12 @@ def _on_table(frame: Frame) -> np.ndarray:
 
 
 def _without_readings(frame: Frame) -> np.ndarray:
-    """Pixels (H, W) bool that have no reading, do not show the robot, and are not in the shadow of the projector."""
-    missing = ~np.isfinite(frame.depth) & ~_shadows(frame)
+    """Pixels (H, W) bool without reading that can show an object.
+
+    They do not show the robot, are not in the shadow of the projector, and not beside what is beyond the table.
+    """
+    beyond = cv2.dilate(beyond_table(frame).astype(np.uint8), _ellipse(2 * _reach(frame.camera.width))) > 0
+    missing = ~np.isfinite(frame.depth) & ~_shadows(frame) & ~beyond
     return missing if frame.robot_mask is None else missing & ~frame.robot_mask
 
 
@@ -329,9 +261,7 @@ def _outlined(frame: Frame, pixels: np.ndarray, seen: _Colours) -> np.ndarray:
     core = cv2.erode(image, _ellipse(scaled_length(_CORE, width))) > 0
     regions, _ = ndimage.label(pixels)
     core |= pixels & ~np.isin(regions, regions[core])  # a thin object is its own core
-    share, mean, variance = _around(seen.lab, core, _CORE_REACH)
-    distance = ((seen.lab - mean) ** 2 / variance).sum(axis=-1)
-    log_ratio = 0.5 * (seen.distance + seen.log_variance - distance - np.log(variance).sum(axis=-1))
+    share, log_ratio = seen.like_object(core)
     log_prior = np.where(frame.valid, np.where(pixels, _REMOVED, -_ADDED), 0)
     return np.asarray(np.where(asked & (share > _FEW_NEAR), log_ratio + log_prior > 0, pixels))
 
@@ -364,10 +294,10 @@ def _around(image: np.ndarray, pixels: np.ndarray, reach: float) -> tuple[np.nda
 
     The surroundings have a standard deviation of `reach` pixels of an image of 640 x 480 pixels.
     """
-    share = _surroundings(pixels.astype(np.float32), reach)
+    share = surroundings(pixels.astype(np.float32), reach)
     n = np.maximum(share, 1e-6)[..., None]
-    mean = _surroundings(image * pixels[..., None], reach) / n
-    variance = np.maximum(_surroundings(image**2 * pixels[..., None], reach) / n - mean**2, 0) + _COLOUR_NOISE
+    mean = surroundings(image * pixels[..., None], reach) / n
+    variance = np.maximum(surroundings(image**2 * pixels[..., None], reach) / n - mean**2, 0) + _COLOUR_NOISE
     return share, mean, variance
 
 
@@ -395,15 +325,6 @@ def _measured_part(frame: Frame) -> np.ndarray:
     if points is not None:
         cv2.fillConvexPoly(part, cv2.convexHull(points), 1)
     return part > 0
-
-
-def _surroundings(image: np.ndarray, reach: float) -> np.ndarray:
-    """Mean of an image (H, W, ...) around each pixel, computed at a lower resolution."""
-    size, step = (image.shape[1], image.shape[0]), 4 if reach > _FINE else 2
-    small = cv2.resize(image, (max(1, size[0] // step), max(1, size[1] // step)), interpolation=cv2.INTER_AREA)
-    spread = max(1.0, scaled_length(reach, size[0]) / step)
-    small = cv2.GaussianBlur(small, (0, 0), spread, borderType=cv2.BORDER_CONSTANT)
-    return cv2.resize(small, size, interpolation=cv2.INTER_LINEAR)
 
 
 def _joined(measured: np.ndarray, silent: np.ndarray, table: np.ndarray, missing: np.ndarray) -> np.ndarray:
