@@ -125,6 +125,7 @@ _COLUMNS = 160
 _WINDOWS = (20, 10)  # pixels: sides of the windows that suggest planes
 _FLAT = 3.0  # largest residual of an inlier, in 1/8 pixels
 _MOST = 5  # planes
+_LEAST_TABLE = 0.05  # share of the readings that are on a table with fewer than the largest plane
 _IN_FRONT = 0.025  # metres: readings farther in front of a plane are not on it
 _TALL = 0.35  # metres: objects are not higher; the table is higher above the floor, and extends farther from a wall
 _PARALLEL, _RIGHT = 15.0, 60.0  # degrees between the normals of parallel planes, and of planes at a right angle
@@ -208,7 +209,7 @@ def _table(frame: Frame) -> np.ndarray:
         in_front = current.above(points) > _IN_FRONT
         used = small.valid.copy()
         used[small.valid] = in_front
-        if in_front.mean() < _MIN_SHARE:
+        if in_front.mean() < _LEAST_TABLE:
             break
         for found in _planes(rays, D, used):
             inliers = in_front.copy()
@@ -232,8 +233,8 @@ def _holds(plane: _Found, largest: _Found, points: np.ndarray) -> bool:
     away = largest.above(own)
     if _RIGHT < angle < 180 - _RIGHT:
         more_upright = largest.up[1] - plane.up[1] > _MORE_UPRIGHT
-        return bool(more_upright and np.percentile(away, 98) > _TALL and plane.inliers.mean() > _MIN_SHARE / 2)
-    if angle > _PARALLEL or np.median(away) < _TALL or plane.inliers.mean() < _MIN_SHARE:
+        return bool(more_upright and np.percentile(away, 98) > _TALL and plane.inliers.mean() > _LEAST_TABLE)
+    if angle > _PARALLEL or np.median(away) < _TALL or plane.inliers.mean() < _LEAST_TABLE:
         return False
     return bool(_standing(plane, points) > _STANDING)
 

@@ -57,7 +57,6 @@ _SOLID, _GLARE = 8.0, 2.0  # radius of a solid gap, pixels; brightness of glare 
 _STEP, _SHADOW = 0.02, 1.2  # smallest step of depth in metres; tolerance of the width of a shadow
 _EDGE = 9  # pixels around the end of a gap that may have cast a shadow
 _FEW_NEAR = 1e-3  # share of the core of objects around a pixel that shows their colours
-_TOUCHING = 0.02  # the same, at about 20 pixels from the core, within which depth is smeared
 _NARROW = 6.0  # pixels between a reading and an estimate that is this reading
 _FEW = 10  # readings of an object that do not determine the depth of its other pixels
 _STANDS = 0.004  # metres: least height of estimated readings above the table, without a grid
@@ -189,7 +188,7 @@ def _doubtful(frame: Frame, raised: np.ndarray, height: np.ndarray, seen: _Colou
     share, log_ratio = seen.like_object(cv2.erode(high, _ellipse(scaled_length(_CORE, frame.camera.width))) > 0)
     beside = (seen.distance < _SHADED) & (-log_ratio > _DOUBT * height)
     alone = (seen.distance < _LIKE_TABLE) & (height < _LOW)
-    found = _opened(low & np.where(share > _TOUCHING, beside, alone), 1)
+    found = _opened(low & np.where(share > _FEW_NEAR, beside, alone), 1)
     return found & ~_enclosed(found, raised & ~found, frame.valid, _PLATE)
 
 

@@ -240,7 +240,7 @@ def test_a_plate_with_the_colour_of_the_table_is_an_object_by_its_rim():
     radius = np.hypot(rows - 390, columns - 310)
     plate = (radius < 45) & patch(slice(340, 440), slice(260, 360))
     rise = np.where(radius > 32, 9.0, 4.0)
-    found = foreground(lifted(frame_of(TWO, width=640, noise=0.3), plate, rise, None), GRID).pixels
+    found = foreground(lifted(frame_of(TWO, width=640, noise=0.3), plate, rise, None)).pixels
     assert found[plate].mean() > 0.95
 
 

@@ -237,7 +237,10 @@ def test_the_table_is_found_before_a_large_floor_and_a_large_wall(wall, floor):
     up, expected = (pose.rotation.inv().apply([0.0, 0.0, 1.0]) for pose in (fitted, camera.pose))
     assert fitted.translation[2] == pytest.approx(1.1, abs=0.01) and np.degrees(np.arccos(up @ expected)) < 1
     assert not any(one.stop for one in examine([Frame(rgb, depth, camera)], [0], GRID))
-    if floor > -1:  # a pose that places the floor at 0 is refused
-        low = camera.at(RigidTransform.from_translation([0, 0, -floor]) * camera.pose)
-        with pytest.raises(InputError, match="floor is taken for the table|no table is at z = 0"):
-            Recording.from_arrays(rgb, depth, camera.K, T_world_camera=low.pose, grid=GRID)
+
+
+def test_a_pose_that_places_the_floor_at_the_height_of_the_table_is_refused():
+    rgb, depth, camera = room(1.0, -0.6)
+    low = RigidTransform.from_translation([0, 0, 0.6]) * camera.pose
+    with pytest.raises(InputError, match="the floor is taken for the table: a second plane is 0.6"):
+        Recording.from_arrays(rgb, depth, camera.K, T_world_camera=low, grid=GRID)
