@@ -82,7 +82,12 @@ def _disparity_of(frame: Frame) -> np.ndarray:
 
 
 def _largest(frame: Frame) -> np.ndarray:
-    """Coefficients (a, b, c) of the plane D = a u + b v + c with the most readings, by RANSAC and least squares."""
+    """Coefficients (a, b, c) of the plane D = a u + b v + c with the most readings. The result is cached."""
+    return memo("largest_plane", frame.key, lambda: read_only(_fit_largest(frame)))
+
+
+def _fit_largest(frame: Frame) -> np.ndarray:
+    """The largest plane by RANSAC and least squares."""
     D = _disparity_of(frame)
     v, u = np.nonzero(np.isfinite(D))
     if len(v) < 100:
@@ -269,7 +274,7 @@ def _beyond(frame: Frame) -> np.ndarray:
         for plane in _walls(small, table):
             rays = frame.camera.rays()
             distance = (_SCALE - frame.depth * (rays @ plane.q)) / np.linalg.norm(plane.q)
-            found |= frame.valid & (distance < _AT_WALL + 2 * depth_sigma(frame.depth)) & (frame.points[..., 2] > 0)
+            found |= frame.valid & (distance < _AT_WALL + 2 * depth_sigma(frame.depth))
     return found
 
 

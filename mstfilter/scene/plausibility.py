@@ -99,6 +99,11 @@ class Look:
         """(n,) bool: whether each depth reading is on the table."""
         return np.asarray(np.abs(self.points[:, 2]) < ON_TABLE)
 
+    @property
+    def everything(self) -> np.ndarray:
+        """(n,) bool: all depth readings."""
+        return np.ones(len(self.points), bool)
+
     @cached_property
     def table(self) -> Plane | None:
         """The plane of the table; None if no plane is found near z = 0."""
@@ -174,7 +179,7 @@ def _repeated(looks: Sequence[Look]) -> Iterator[Finding]:
 
 def _pose(first: Look) -> Iterator[Finding]:
     """Findings if the depth readings at the first pause contradict the pose: their table is not at z = 0."""
-    camera, table, free = first.frame.camera, first.table, plane_of(first.frame)
+    camera, table, free = first.frame.camera, first.table, plane_of(first.frame, first.everything)
     hints = (
         "check the pose: z of the world is up, the table is at z = 0; without a pose it is found from the table",
         "T_world_camera maps points of the camera to the world; is this the inverse?",
@@ -188,7 +193,7 @@ def _pose(first: Look) -> Iterator[Finding]:
     elif table is None and free is not None and (first.on_table.mean() < _MIN_ON_TABLE or free.tilt > 150):
         text = f"the largest plane is tilted by {free.tilt:.0f} degrees and at z = {free.height:.3f} m"
         yield Finding(True, f"no table is at z = 0: {text}, expected z = 0", hints)
-    elif free is None or free.tilt > 2 * _MAX_TILT or abs(free.height) > 2 * _MAX_HEIGHT:
+    else:
         yield from _other_support(first)
 
 
@@ -200,7 +205,12 @@ def _other_support(first: Look) -> Iterator[Finding]:
     wall and extends far from the wall. In the image, the normal of a table points up, and that of a wall does not.
     """
     raised = first.points[:, 2] > ON_TABLE
-    plane = plane_of(first.frame, raised) if raised.mean() > _MIN_ON_TABLE else None
+    if raised.mean() < _MIN_ON_TABLE:
+        return
+    found = plane_of(first.frame)
+    if found is not None and found.tilt < 2 * _MAX_TILT and abs(found.height) < 2 * _MAX_HEIGHT:
+        return
+    plane = plane_of(first.frame, raised)
     if plane is None:
         return
     hint = "or remove the depth readings beyond the table (NaN or 0), or turn the camera towards the table"

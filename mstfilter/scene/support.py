@@ -162,7 +162,7 @@ def _regions_of_readings(frame: Frame, grid: VoxelGrid | None, seen: _Colours) -
     height = np.where(coloured, filled_above_table(frame), height_in_noise(frame, filled=True))
     height = np.minimum(np.nan_to_num(height, posinf=1e3), 1e3)
     raised = readings_above_table(frame, grid) & (height > TABLE_TOLERANCE) & ~beyond_table(frame)
-    raised &= ~_doubtful(frame, raised, height, seen)
+    raised &= ~_doubtful(frame, raised, height, seen) & ~(_beside_beyond(frame) & (height < _SMEARED))
     solid = raised | (~frame.valid & (height > TABLE_TOLERANCE))
     core = cv2.morphologyEx(solid.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     regions, _ = ndimage.label(core)
@@ -203,9 +203,13 @@ def _without_readings(frame: Frame) -> np.ndarray:
 
     They do not show the robot, are not in the shadow of the projector, and not beside what is beyond the table.
     """
-    beyond = cv2.dilate(beyond_table(frame).astype(np.uint8), _ellipse(2 * _reach(frame.camera.width))) > 0
-    missing = ~np.isfinite(frame.depth) & ~_shadows(frame) & ~beyond
+    missing = ~np.isfinite(frame.depth) & ~_shadows(frame) & ~_beside_beyond(frame)
     return missing if frame.robot_mask is None else missing & ~frame.robot_mask
+
+
+def _beside_beyond(frame: Frame) -> np.ndarray:
+    """Pixels (H, W) bool beside walls and what else is beyond the table, where depth is smeared or missing."""
+    return cv2.dilate(beyond_table(frame).astype(np.uint8), _ellipse(2 * _reach(frame.camera.width))) > 0
 
 
 def _shadows(frame: Frame) -> np.ndarray:
