@@ -136,6 +136,7 @@ _TALL = 0.35  # metres: objects are not higher; the table is higher above the fl
 _PARALLEL, _RIGHT = 15.0, 60.0  # degrees between the normals of parallel planes, and of planes at a right angle
 _MORE_UPRIGHT = 0.4  # difference of the upward parts of the normals of a table and of a wall, in the image
 _ON_TABLE = 0.01  # metres
+_LEAST_PART = 0.1  # share of the largest part of a table in a separate part
 _FEW_ON_TABLE = 100  # readings of the table in the reduced image
 _BESIDE_TABLE = 0.1  # metres beyond the readings of the table, where an object can still stand
 _AT_WALL = 0.01  # metres
@@ -265,7 +266,7 @@ def beyond_table(frame: Frame) -> np.ndarray:
 def _beyond(frame: Frame) -> np.ndarray:
     small = sampled(frame, _COLUMNS)
     points = small.points[small.valid]
-    table = without_strips(points[np.abs(points[:, 2]) < _ON_TABLE, :2], small.camera.position[:2])
+    table = without_strips(points[np.abs(points[:, 2]) < _ON_TABLE, :2], small.camera.position[:2], _LEAST_PART)
     if len(table) < _FEW_ON_TABLE:
         return np.zeros(frame.valid.shape, bool)
     found = np.zeros(frame.valid.shape, bool)
@@ -427,10 +428,11 @@ _CELL, _STRIP = 0.1, 0.02  # metres: gap between a table and another surface; st
 _FAR = 10.0  # metres from the camera, beyond which no table is expected
 
 
-def without_strips(points: np.ndarray, camera: np.ndarray) -> np.ndarray:
+def without_strips(points: np.ndarray, camera: np.ndarray, least: float = 0.0) -> np.ndarray:
     """Table readings (N, 2) without those of a wall behind the table, which form a thin separate strip at z = 0.
 
-    `camera` (2,) is the position of the camera in the plane of the table.
+    `camera` (2,) is the position of the camera in the plane of the table. Separate parts with less than the share
+    `least` of the readings of the largest part are left out too: they are of a chair, for example.
     """
     from scipy import ndimage
 
@@ -447,6 +449,6 @@ def without_strips(points: np.ndarray, camera: np.ndarray) -> np.ndarray:
     xx, yy, xy = (np.bincount(group, product) / n for product in (x * x, y * y, x * y))
     across = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)  # the smaller eigenvalue of the covariance
     noise = 2 * depth_sigma(np.linalg.norm(mean - camera, axis=1))
-    keep = (n >= 3) & (across > np.maximum(_STRIP, noise) ** 2)
+    keep = (n >= max(3, least * n.max())) & (across > np.maximum(_STRIP, noise) ** 2)
     keep[n.argmax()] = True
     return near[keep[group]]
