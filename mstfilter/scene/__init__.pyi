@@ -45,6 +45,7 @@ from mstfilter.scene.heights import (
     readings_above_table as readings_above_table,
 )
 from mstfilter.scene.occupancy import Occupancy as Occupancy
+from mstfilter.scene.outlines import outlined as outlined
 from mstfilter.scene.partitions import (
     CommonRefinement as CommonRefinement,
     canonical as canonical,

@@ -6,9 +6,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from numpy.typing import ArrayLike
-from scipy.ndimage import binary_erosion, distance_transform_edt, gaussian_filter, label
+from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt, gaussian_filter, label
 
-from mstfilter.scene import Frame, foreground, pixels_above_table, readings_above_table, render
+from mstfilter.scene import (
+    Frame,
+    Hypothesis,
+    VoxelGrid,
+    foreground,
+    outlined,
+    pixels_above_table,
+    project,
+    readings_above_table,
+    render,
+)
 from mstfilter.scene.heights import height_in_noise
 from mstfilter.scene.planes import beyond_table
 from tests.mst.segmentation.scenes import GRID, TWO, camera, frame_of
@@ -295,3 +305,19 @@ def test_a_shadow_of_the_projector_is_no_object():
     assert narrow.sum() > 100
     assert foreground(without(frame, narrow, (20, 20, 200)), GRID).pixels[narrow].mean() < 0.1
     assert foreground(without(frame, wide, (20, 20, 200)), GRID).pixels[wide].mean() > 0.9
+
+
+def test_outlines_of_the_image_are_nearer_to_the_truth_than_those_of_voxels():
+    """The hypothesis has coarser voxels than the scene, and one object is a voxel too large on every side."""
+    coarse = VoxelGrid(GRID.origin, 2 * GRID.voxel_size, tuple(n // 2 for n in GRID.shape))
+    labels = TWO[::2, ::2, ::2].copy()
+    labels[binary_dilation(labels == 2) & (labels == 0)] = 2
+    hypothesis, frame = Hypothesis(labels, coarse), frame_of(TWO, width=640, noise=0.3)
+    before, after = project(hypothesis, frame.camera), outlined(hypothesis, frame)
+    for label in (1, 2):
+        overlap = [
+            ((image == label) & (label == SEEN)).sum() / ((image == label) | (label == SEEN)).sum()
+            for image in (before, after)
+        ]
+        assert overlap[1] > 0.93 and overlap[1] > overlap[0] + 0.02
+    assert not outlined(Hypothesis(0 * labels, coarse), frame).any()
