@@ -40,6 +40,7 @@ from mstfilter.scene import Frame, Recording, above_table, posed_camera, project
 HERE = Path(__file__).resolve().parent
 PAUSES = ("v000", "v004")  #: of `two_cameras`
 _SAME_TABLE = 0.05, 3.0  # metres and degrees between two tables that are the same
+_DEEPEST = 12.0  # sensor units: readings farther below are of other things
 
 
 @dataclass(frozen=True)
@@ -76,8 +77,7 @@ def noise_below(frame: Frame) -> float:
     """98th percentile of the distances of the readings below the table, in sensor units."""
     with np.errstate(invalid="ignore"):
         below = -above_table(frame)[frame.valid]
-    # Beyond the end of the table there are other things below it.
-    below = below[(below > 0) & (below < 40)]
+    below = below[(below > 0) & (below < _DEEPEST)]
     return float(np.percentile(below, 98)) if len(below) else np.nan
 
 

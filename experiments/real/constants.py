@@ -28,8 +28,8 @@ HERE = Path(__file__).resolve().parent
 VALUES = {
     "_LIKE_TABLE": (2.0, 3.0, 5.0),
     "_SHADED": (4.0, 6.0, 9.0),
-    "_DOUBT": (0.2, 0.4, 0.8),
-    "_SMEARED": (12.0, 20.0, 30.0),
+    "_DOUBT": (0.4, 0.8, 1.6),
+    "_SMEARED": (20.0, 30.0, 40.0),
     "_LOW": (4.0, 6.0, 9.0),
 }
 #: Pauses of sequences with label images.

@@ -64,7 +64,7 @@ _LAYER = 0.75  # the same in voxels of the grid: at least one layer of voxel cen
 _LOW = 6.0  # rise of noise with the colour of the table, in units of noise
 _LIKE_TABLE = 3.0  # squared distance of such a colour
 # The same beside an object: rise, squared distance of colour, least log odds of the table per unit of noise.
-_SMEARED, _SHADED, _DOUBT = 20.0, 6.0, 0.4
+_SMEARED, _SHADED, _DOUBT = 30.0, 6.0, 0.8
 _PLATE = 0.7  # share of the readings around the inside of a plate that are higher
 _SAME_COLOUR, _OTHER_COLOUR = 2.0, 0.25  # squared distance of the colour of the table; share of pixels above it
 _OUTLINE = 6.0  # pixels on both sides of an outline that are assigned by colour

@@ -312,12 +312,9 @@ def test_outlines_of_the_image_are_nearer_to_the_truth_than_those_of_voxels():
     coarse = VoxelGrid(GRID.origin, 2 * GRID.voxel_size, tuple(n // 2 for n in GRID.shape))
     labels = TWO[::2, ::2, ::2].copy()
     labels[binary_dilation(labels == 2) & (labels == 0)] = 2
-    hypothesis, frame = Hypothesis(labels, coarse), frame_of(TWO, width=640, noise=0.3)
+    hypothesis, frame = Hypothesis.from_labels(labels, coarse), frame_of(TWO, width=640, noise=0.3)
     before, after = project(hypothesis, frame.camera), outlined(hypothesis, frame)
-    for label in (1, 2):
-        overlap = [
-            ((image == label) & (label == SEEN)).sum() / ((image == label) | (label == SEEN)).sum()
-            for image in (before, after)
-        ]
+    for k in (1, 2):
+        overlap = [((one == k) & (k == SEEN)).sum() / ((one == k) | (k == SEEN)).sum() for one in (before, after)]
         assert overlap[1] > 0.93 and overlap[1] > overlap[0] + 0.02
-    assert not outlined(Hypothesis(0 * labels, coarse), frame).any()
+    assert not outlined(Hypothesis.from_labels(0 * labels, coarse), frame).any()
