@@ -22,13 +22,13 @@ from torch import Tensor, nn
 from mst_training.loop import Training
 from mst_training.scenes import Samples
 from mst_training.seam_data import SeamSamples
-from mstfilter.mst.segmentation.seam_measures import CHANNELS
+from mstfilter.mst.segmentation.seam_measures import STRIP_CHANNELS
 from mstfilter.mst.segmentation.seam_network import INPUTS, SEAM_ARCHITECTURE, SeamNet, decoded
 from mstfilter.scoring.forecasts import ForecastTable
 
 _CLEAN, _SLACK = 0.95, 0.02  # least purity of a clean division, and the most that it is less pure than the best
-_COLOURS = slice(CHANNELS.index("lightness"), CHANNELS.index("b") + 1)
-_TURNED = [CHANNELS.index(name) for name in ("slope across", "distance")]  # change their sign in a mirror
+_COLOURS = slice(STRIP_CHANNELS.index("lightness"), STRIP_CHANNELS.index("b") + 1)
+_TURNED = [STRIP_CHANNELS.index(name) for name in ("slope across", "distance")]  # change their sign in a mirror
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class SeamsTraining(Training):
             rng = np.random.default_rng([self.seed, 2, step])
             x, strips, *others = _batch(samples, [rows[k] for k in chosen.tolist()])
             if rng.uniform() < 0.5:
-                strips = strips.flip(3)[:, [1, 0, *range(2, len(CHANNELS))]]
+                strips = strips.flip(3)[:, [1, 0, *range(2, len(STRIP_CHANNELS))]]
                 strips[:, _TURNED] *= -1
             strips[:, _COLOURS] *= 0.0 if rng.uniform() < self.colour_dropout else float(rng.uniform(0.5, 1.2))
             yield x, strips, *others
@@ -96,7 +96,7 @@ class SeamsTraining(Training):
         for name, chosen in (("all", grouped >= 0), ("groups", grouped), ("other scenes", ~grouped)):
             table.append({"scenes": name, **_figures(calibrated, torch.from_numpy(chosen))})
         described = {
-            "network": {"channels": [*INPUTS, *CHANNELS], "width": self.width},
+            "network": {"channels": [*INPUTS, *STRIP_CHANNELS], "width": self.width},
             "calibration": {"scale": scale, "shift": shift},
         }
         return described, dict(list(table[0].items())[1:]), table

@@ -98,7 +98,7 @@ def common_refinement(segmentations: Sequence[np.ndarray]) -> CommonRefinement:
 class WeightedSegmentations:
     """Segmentations of one image with their weights.
 
-    >>> camera = Camera.from_intrinsics(500, 500, 1, 0, 3, 1, np.eye(4))
+    >>> camera = Camera.from_intrinsics(500, 500, 1, 0, 3, 1, RigidTransform.identity())
     >>> cells, one, two = np.array([[0, 1, 2]]), [1, 1], [1, 2]
     >>> ways = WeightedSegmentations(cells, np.array([one, two]), np.array([0.4, 0.6]), camera)
     >>> ways.refinement.cells, ways.are_of(camera)

@@ -163,7 +163,7 @@ def test_conditional_smc_is_the_same_for_every_form_of_a_model(name, same):
         other = conditional_path(CONDITIONAL[same], SYMBOLS, seed, other)
         np.testing.assert_array_equal(states_of(one), other)
         distinct.add(tuple(other))
-    assert len(distinct) > 3
+    assert len(distinct) >= 3
 
 
 def test_path_log_prob_is_the_joint_density():

@@ -10,7 +10,7 @@ from mst_training.loop import run_training
 from mst_training.seam_data import SeamSamples, _purity
 from mst_training.seams import SeamsTraining, region_losses
 from mstfilter.mst.segmentation.divisions import Division
-from mstfilter.mst.segmentation.seam_measures import CHANNELS, STRIP
+from mstfilter.mst.segmentation.seam_measures import STRIP, STRIP_CHANNELS
 from mstfilter.mst.segmentation.seam_network import INPUTS, load_seam_network
 
 SMALL = SeamsTraining(n_scenes=1, n_validation=1, n_test=1, width=8, steps=60, batch=6, rate=1e-2, average=0.8)
@@ -23,11 +23,11 @@ def samples(seed, n=40):
     clean = two[:, None] & (np.arange(3) == rng.integers(0, 3, n)[:, None])
     x = rng.normal(size=(n, 3, len(INPUTS))).astype(np.float32)
     x[..., 0] += 3 * clean
-    strip = rng.integers(100, 156, (n, 3, len(CHANNELS), *STRIP)).astype(np.uint8)
+    strip = rng.integers(100, 156, (n, 3, len(STRIP_CHANNELS), *STRIP)).astype(np.uint8)
     strip[..., 4, :, :] += (60 * clean[..., None, None]).astype(np.uint8)
     every = {
         "x": x.reshape(3 * n, -1),
-        "strip": strip.reshape(3 * n, len(CHANNELS), *STRIP),
+        "strip": strip.reshape(3 * n, len(STRIP_CHANNELS), *STRIP),
         "purity": clean.reshape(-1).astype(np.float32),
         "region": np.repeat(np.arange(n), 3),
         "objects": np.repeat(1 + two, 3).astype(np.int32),

@@ -7,7 +7,7 @@ through faces, prints and edges. So each division is described by
 - the `FEATURES` of the pair of its sides, as those that the tree merges;
 - `SEAM_FEATURES`: how the evidence runs along the seam, how well the sides fit to each other, and whether the region
   or its sides are the more compact;
-- a *strip*: an image of `STRIP` pixels that follows the seam, in `CHANNELS`.
+- a *strip*: an image of `STRIP` pixels that follows the seam, in `STRIP_CHANNELS`.
 
 >>> measures = SeamMeasures.of(image)
 >>> x, strips = measures.describe(pixels, divisions(image, pixels))       # (k, f) float32, (k, c, 64, 24) uint8
@@ -31,7 +31,7 @@ STRIP = (64, 24)  #: pixels along and across the seam
 #: Channels of a strip: the two sides; other objects; whether there is a reading; boundary map; log odds of a border;
 #: relief of the disparity; slope of the disparity across and along the seam; height; Lab colour; distance from the
 #: plane.
-CHANNELS = (
+STRIP_CHANNELS = (
     *("first", "second", "others", "reading", "boundary", "border", "relief"),
     *("slope across", "slope along", "height", "lightness", "a", "b", "distance"),
 )
@@ -245,7 +245,7 @@ class _Region:
         """The strip (c, *STRIP) uint8 of a division."""
         seam = self.seam(division.side).astype(np.float64)
         if not len(seam):
-            return np.full((len(CHANNELS), *STRIP), _LEVELS, np.uint8)
+            return np.full((len(STRIP_CHANNELS), *STRIP), _LEVELS, np.uint8)
         middle = seam.mean(axis=0)
         spread = seam - middle
         axis = np.linalg.eigh(spread.T @ spread)[1][:, 1]

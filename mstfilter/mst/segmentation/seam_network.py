@@ -20,7 +20,7 @@ from torch.nn import functional
 
 from mstfilter.base.trained import TrainedModel, calibrated_network, layer_size, load_once, one_thread, open_model
 from mstfilter.mst.segmentation.learned_tree import FEATURES
-from mstfilter.mst.segmentation.seam_measures import CHANNELS, SEAM_FEATURES, STRIP
+from mstfilter.mst.segmentation.seam_measures import SEAM_FEATURES, STRIP, STRIP_CHANNELS
 
 SEAM_ARCHITECTURE = "seam-judge"
 INPUTS = (*FEATURES, *SEAM_FEATURES)  #: Names of the numbers that describe a division
@@ -40,7 +40,10 @@ class SeamNet(nn.Module):
             return [nn.Conv2d(n, m, size, stride, size // 2), nn.GroupNorm(4, m), nn.SiLU()]
 
         self.conv = nn.Sequential(
-            *layer(len(CHANNELS), a, 5, 2), *layer(a, b, 3, 1), *layer(b, hidden, 3, 2), *layer(hidden, hidden, 3, 1)
+            *layer(len(STRIP_CHANNELS), a, 5, 2),
+            *layer(a, b, 3, 1),
+            *layer(b, hidden, 3, 2),
+            *layer(hidden, hidden, 3, 1),
         )
         self.squeeze = nn.Conv2d(hidden, 8, 1)
         self.flat = nn.Linear(8 * (STRIP[0] // 4) * (STRIP[1] // 4) + 2 * hidden, 64)
@@ -67,7 +70,7 @@ class SeamNetwork:
 
     def __init__(self, model: TrainedModel) -> None:
         self.net, self.scale, self.shift = calibrated_network(
-            model, [*INPUTS, *CHANNELS], lambda values: SeamNet(layer_size(values, "width", 4))
+            model, [*INPUTS, *STRIP_CHANNELS], lambda values: SeamNet(layer_size(values, "width", 4))
         )
         self.key = model.key
 

@@ -13,7 +13,7 @@ from mstfilter.mst.segmentation import ColourDepthBoundary, MergeLogOdds, SeamTr
 from mstfilter.mst.segmentation.divisions import SeamImage, divisions
 from mstfilter.mst.segmentation.learned_tree import FEATURES, pair_features
 from mstfilter.mst.segmentation.regions import measure_regions
-from mstfilter.mst.segmentation.seam_measures import CHANNELS, SEAM_FEATURES, STRIP, SeamMeasures
+from mstfilter.mst.segmentation.seam_measures import SEAM_FEATURES, STRIP, STRIP_CHANNELS, SeamMeasures
 from mstfilter.mst.segmentation.seam_network import INPUTS, SEAM_ARCHITECTURE, SeamNet
 from mstfilter.mst.segmentation.seams import BaseTree, _Examination
 from mstfilter.scene import Frame, pixels_above_table, render
@@ -74,7 +74,7 @@ def test_features_of_the_sides_are_those_of_measured_regions(touching):
     found = divisions(image, pixels, [truth == 1])
     x, strips = SeamMeasures.of(image, objects).describe(pixels, found)
     assert x.shape == (len(found), len(INPUTS)) and np.isfinite(x).all()
-    assert strips.shape == (len(found), len(CHANNELS), *STRIP)
+    assert strips.shape == (len(found), len(STRIP_CHANNELS), *STRIP)
     for k in (0, len(found) - 1):
         regions = np.zeros(frame.depth.shape, np.int64)
         regions.ravel()[pixels] = 1 + found[k].side
@@ -104,7 +104,7 @@ def write_judge(folder, bias):
     torch.nn.init.constant_(net.head[-1].bias, bias)
     described = {
         "architecture": SEAM_ARCHITECTURE,
-        "network": {"channels": [*INPUTS, *CHANNELS], "width": 8},
+        "network": {"channels": [*INPUTS, *STRIP_CHANNELS], "width": 8},
         "calibration": {"scale": 1.0, "shift": 0.0},
     }
     write_model(folder, described, {name: t.numpy() for name, t in net.state_dict().items()})
