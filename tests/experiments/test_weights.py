@@ -1,4 +1,4 @@
-"""The studies of experiments/weights: their definitions by hand and by enumeration."""
+"""The study of experiments/weights: its definitions by hand and by enumeration."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 
 from mstfilter.base.files import read_csv
-from tests.experiments.scripts import EXPERIMENTS, import_script, own_modules, run_script
+from tests.experiments.scripts import import_script, run_script
 
 reliability = import_script("weights/reliability.py")
-with own_modules(EXPERIMENTS / "weights"):
-    ambiguity = import_script("weights/ambiguity.py")
 
 
 def test_disagreement_counts_pairs_of_readings():
@@ -57,23 +55,6 @@ def test_the_most_probable_image_has_the_most_probable_components():
         assert not found["scene"].right[found["scene"].p.argmax()]
 
 
-def test_print_of_two_boxes_on_one():
-    rng = np.random.default_rng(1)
-    whole = ambiguity.carton(np.array([0.03, 0.08, 0.05]))
-    skin = ambiguity.draw_skin(rng, whole, ambiguity.TUNING)
-    again = ambiguity.joined(*ambiguity.sliced(skin, 1, 2))
-    for one, other in zip(again.charts, skin.charts, strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
-@pytest.mark.parametrize("seed", [0, 6])  # one box; two boxes
-def test_sides_of_an_ambiguous_scene(seed):
-    clips, sides, row = ambiguity.scene(seed)
-    n = np.bincount(sides.ravel(), minlength=3)
-    assert set(np.unique(sides)) == {0, 1, 2} and 0.2 < n[1] / n[1:].sum() < 0.8
-    assert clips[1].after is not clips[0].after and row["one"] == (seed == 0)
-
-
 @pytest.mark.nightly
 def test_small_forms(tmp_path):
     run_script("weights/reliability.py", "--smoke", "--out", tmp_path)
@@ -81,6 +62,3 @@ def test_small_forms(tmp_path):
     at_1 = {row["question"]: row for row in rows if row["temperature"] == "1.0"}
     assert {"component", "image", "scene"} <= set(at_1)
     assert all(0 <= float(row["frequency"]) <= 1 and float(row["log_loss"]) >= 0 for row in at_1.values())
-    run_script("weights/ambiguity.py", "--smoke", "--out", tmp_path)
-    assert len(read_csv(tmp_path / "scenes.csv")) == 4
-    assert read_csv(tmp_path / "ambiguity.csv")[0]["scenes"] == "all"

@@ -289,6 +289,24 @@ def _put_on_base(rng: np.random.Generator, world: PhysicsWorld, k: int, base: in
     return False
 
 
+def _put_apart(rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily, k: int) -> bool:
+    """Put object k on a free place of the table at which all of it is in view."""
+    start, shape = world.positions()[k], world.shapes[k]
+    reach = np.array([family.workspace_x, family.workspace_y]) / 2
+    for _ in range(_ATTEMPTS):
+        rotation, height = _draw_rest_pose(rng, shape)
+        place = np.array([*rng.uniform(-reach, reach), height + 0.0002])
+        if not family.contains_points(shape.corners @ rotation.T + place).all():
+            continue
+        world.place(k, place, rotation)
+        world.forward()
+        if not world.overlaps(k):
+            return True
+    world.place(k, start, np.eye(3))
+    world.forward()
+    return False
+
+
 def _place_group(rng: np.random.Generator, world: PhysicsWorld, group: Group, first: bool) -> bool:
     """Place a group where it overlaps no other object."""
     radius = 0.05 if first else min(0.28, 0.16 + 0.012 * world.n_objects)
@@ -357,6 +375,7 @@ def _try_arrangement(
     camera = family.camera().scaled(160 / family.width)
     order = [j for k in standing + stacked for j in (k, *(t for t in twins if twin_of[t] == k))] + hidden
     placed: list[int] = []
+    apart: list[int] = []  # those of the placed objects beside which no other object is put
     if objects.base:
         turn = about_z(float(rng.uniform(0, 2 * np.pi)))
         world.place(0, (*_CENTRE, world.shapes[0].half[2] + 0.0002), turn)
@@ -371,18 +390,28 @@ def _try_arrangement(
         if on_base and _put_on_base(rng, world, k, 0):
             placed.append(k)
             continue
-        if not placed:
+        free = family.apart > 0 and k in standing and k not in twin_of and twin_of[k] < 0
+        if free and rng.uniform() < family.apart and _put_apart(rng, world, family, k):
+            placed.append(k)
+            apart.append(k)
+            continue
+        others = [j for j in placed if j not in apart]
+        if not others:
             rotation, height = _draw_rest_pose(rng, world.shapes[k], pose)
             world.place(k, (*(_CENTRE + rng.uniform(-0.05, 0.05, 2)), height + 0.0002), rotation)
+            if apart:
+                world.forward()
+                if world.overlaps(k):
+                    return False
         elif twin_of[k] >= 0:
             if not _put_beside(rng, world, k, [twin_of[k]], _TOUCH):
                 return False
         elif k in hidden:
-            if not (_put_behind(rng, world, k, placed, camera) or _put_beside(rng, world, k, placed, _TOUCH)):
+            if not (_put_behind(rng, world, k, placed, camera) or _put_beside(rng, world, k, others, _TOUCH)):
                 return False
         elif not (k in stacked and _put_on_top(rng, world, k, placed)):
             gap = _TOUCH if rng.uniform() < family.contact else float(rng.uniform(0.01, 0.04))
-            if not _put_beside(rng, world, k, placed, gap, pose=pose):
+            if not _put_beside(rng, world, k, others, gap, pose=pose):
                 return False
         placed.append(k)
     world.forward()

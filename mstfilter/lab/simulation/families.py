@@ -101,6 +101,9 @@ class SceneFamily(Bounded):
     object_scale: PositiveFloat = 1.0  #: factor of the lengths in the files of meshes, 0.001 for millimetres
     object_up: Literal["auto", "y", "z"] = "auto"  #: axis that points up in the files; "auto": y for glTF, else z
     n_dropped: NonNegativeInt = 0  #: objects that fall into, onto or against another object
+    #: Probability that an object stands at any free place of the table in view, instead of beside another object.
+    #: Twins and objects that are stacked, hidden or dropped stand where they have to.
+    apart: Share = 0.0
     furniture: Share = 0.0  #: probability that a wall, a board or a tray is in view
     groups: Literal["", "row", "stack", "pack"] = ""  #: how the objects of a group stand
     n_groups: NonNegativeInt = 0  #: groups of objects; the other objects are alone
@@ -258,12 +261,14 @@ SCENE_FAMILIES: dict[str, SceneFamily] = {
     "topple": replace(_S2, name="topple", min_moved=1, min_toppled=1),
 }
 
-_MESHES: dict[str, Any] = {"objects": "$MSTFILTER_OBJECTS", "mesh_pool": "by seed", "furniture": 0.2}
+_MESHES: dict[str, Any] = {
+    "objects": "$MSTFILTER_OBJECTS", "mesh_pool": "by seed", "apart": 0.8, "furniture": 0.2, "min_moved": 2
+}  # fmt: skip
 _GROUPED = replace(_STUDIED, n_twins=0, n_stacked=0, min_moved=1, push_aims="apart, together, nothing")
 SCENE_FAMILIES |= {
     "m1": replace(SCENE_FAMILIES["s1"], name="m1", n_twins=0, n_dropped=1, **_MESHES),
-    "m2": replace(_S2, name="m2", n_twins=1, n_dropped=2, **_MESHES),
-    "m3": replace(SCENE_FAMILIES["s3"], name="m3", n_twins=2, n_stacked=3, n_dropped=3, **_MESHES),
+    "m2": replace(_S2, name="m2", n_twins=1, n_stacked=1, n_dropped=1, **_MESHES),
+    "m3": replace(SCENE_FAMILIES["s3"], name="m3", n_twins=2, n_stacked=2, n_dropped=2, **_MESHES),
     "row": replace(_GROUPED, name="row", n_objects_min=3, n_objects_max=5, groups="row", n_groups=2),
     "stack": replace(_GROUPED, name="stack", n_objects_min=3, n_objects_max=5, groups="stack", n_groups=2),
     "pack": replace(_GROUPED, name="pack", n_objects_min=2, n_objects_max=4, groups="pack", n_groups=1),

@@ -58,6 +58,9 @@ class Group:
     parts: tuple[Part, ...]  #: in the frame of the group
     skins: tuple[Skin, ...]
     one: bool  #: whether the parts are one rigid body
+    #: What the parts look like: equal with "one print" over all, with the "same print" or with "own prints"; or
+    #: "different" parts.
+    look: str
     objects: tuple[int, ...] = ()  #: indices of the objects in the scene: one for all parts, or one for each
 
     def shapes(self) -> list[Shape]:
@@ -109,7 +112,8 @@ class Group:
             }
             for k, part in zip(owners, parts, strict=True)
         ]
-        return {"kind": self.kind, "one": self.one, "objects": [k + 1 for k in self.objects], "parts": described}
+        objects = [k + 1 for k in self.objects]
+        return {"kind": self.kind, "one": self.one, "look": self.look, "objects": objects, "parts": described}
 
 
 def _book(rng: np.random.Generator, pool: Pool) -> Shape:
@@ -174,6 +178,7 @@ class _Look:
     shapes: list[Shape]
     turns: list[np.ndarray]
     skins: list[Skin]
+    name: str  #: see `Group.look`
 
 
 def _draw_look(
@@ -201,14 +206,16 @@ def _draw_look(
             half = first.half * np.where(np.arange(3) == body, n, 1)
             whole = Shape(first.family, first.name, [box((half[0], half[1], half[2]))], first.mass, "box",
                           first.rests, first.finish)  # fmt: skip
-            return _Look(shapes, turns, sliced(draw_skin(rng, whole, pool), body, n)[:: 1 if along[body] > 0 else -1])
+            skins = sliced(draw_skin(rng, whole, pool), body, n)[:: 1 if along[body] > 0 else -1]
+            return _Look(shapes, turns, skins, "one print")
         skin = draw_skin(rng, first, pool)
-        return _Look(shapes, turns, [skin if way == 1 or k == 0 else draw_skin(rng, first, pool) for k in range(n)])
+        skins = [skin if way == 1 or k == 0 else draw_skin(rng, first, pool) for k in range(n)]
+        return _Look(shapes, turns, skins, "same print" if way == 1 else "own prints")
     shapes = [first]
     while len(shapes) < n:
         shapes.append(draw(kind if rng.uniform() < 0.6 else kinds[int(rng.integers(len(kinds)))]))
     turns = [turn] + [_draw_stance(rng, shape, flat) for shape in shapes[1:]]
-    return _Look(shapes, turns, [draw_skin(rng, shape, pool) for shape in shapes])
+    return _Look(shapes, turns, [draw_skin(rng, shape, pool) for shape in shapes], "different")
 
 
 def draw_group(
@@ -225,13 +232,13 @@ def draw_group(
 
     one = bool(rng.uniform() < family.one_share)
     makers = {"row": _row, "stack": _stack, "pack": _pack}
-    parts, skins = makers[family.groups](rng, draw, pool, one)
+    parts, skins, look = makers[family.groups](rng, draw, pool, one)
     middle = np.mean([part.position for part in parts], axis=0) * (1, 1, 0)
     parts = [Part(part.shape, part.rotation, part.position - middle) for part in parts]
-    return Group(family.groups, tuple(parts), tuple(skins), one)
+    return Group(family.groups, tuple(parts), tuple(skins), one, look)
 
 
-_Drawn = tuple[list[Part], list[Skin]]
+_Drawn = tuple[list[Part], list[Skin], str]
 
 
 def _row(rng: np.random.Generator, draw: Callable[[str], Shape], pool: Pool, one: bool) -> _Drawn:
@@ -248,7 +255,7 @@ def _row(rng: np.random.Generator, draw: Callable[[str], Shape], pool: Pool, one
         front = half[1] - _extent(look.shapes[0], look.turns[0])[1]
         parts.append(Part(shape, about_z(angle) @ turn, np.array([edge + gap + reach, front + offset, half[2]])))
         edge += gap + 2 * reach
-    return parts, look.skins
+    return parts, look.skins, look.name
 
 
 def _stack(rng: np.random.Generator, draw: Callable[[str], Shape], pool: Pool, one: bool) -> _Drawn:
@@ -271,7 +278,7 @@ def _stack(rng: np.random.Generator, draw: Callable[[str], Shape], pool: Pool, o
             at = at + rng.uniform(-room, room)
         parts.append(Part(look.shapes[k], about_z(angle) @ look.turns[k], np.array([*at, height + sizes[k][2]])))
         height += 2 * sizes[k][2]
-    return parts, [look.skins[k] for k in order]
+    return parts, [look.skins[k] for k in order], look.name
 
 
 def _pack(rng: np.random.Generator, draw: Callable[[str], Shape], pool: Pool, one: bool) -> _Drawn:
@@ -295,7 +302,7 @@ def _pack(rng: np.random.Generator, draw: Callable[[str], Shape], pool: Pool, on
             spin = about_z(angle)
             parts.append(Part(shape, spin @ turn, np.array([*at, half[2]])))
             skins.append(skin if alike else draw_skin(rng, shape, pool))
-    return parts, skins
+    return parts, skins, "same print" if alike else "own prints"
 
 
 def part_image(recording: Recording, frame: int) -> np.ndarray:

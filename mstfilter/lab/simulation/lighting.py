@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -79,30 +80,56 @@ class Stage:
         return self.world.cast(origin, directions, groups, self._data)
 
 
-def _representatives(block: np.ndarray, geom: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """For each point (n,), the first point of its `block` (n,) and geom, or itself if that one is not near."""
-    key = block * (int(geom.max(initial=0)) + 1) + geom
-    _, first, same = np.unique(key, return_index=True, return_inverse=True)
-    found = first[same.reshape(-1)]
-    apart = np.abs(points - points[found]).max(axis=1, initial=0.0) > _NEAR
-    return np.where(apart, np.arange(len(geom)), found)
+class _Shared(NamedTuple):
+    """Which points share shadow rays."""
+
+    first: np.ndarray  #: (n,) the first point of the block and geom of each point, or itself if that one is not near
+    beside: (
+        np.ndarray
+    )  #: (n, 4) the first points of the same geom in the blocks beside, or `first` where there is none
+
+    @classmethod
+    def of(cls, block: np.ndarray, stride: int, geom: np.ndarray, points: np.ndarray) -> _Shared:
+        """Points (n, 3) on geoms (n,) in blocks (n,) of pixels; `stride` is from one row of blocks to the next."""
+        n_geoms = int(geom.max(initial=0)) + 1
+        keys, example, same = np.unique(block * n_geoms + geom, return_index=True, return_inverse=True)
+        first = example[same.reshape(-1)]
+        apart = np.abs(points - points[first]).max(axis=1, initial=0.0) > _NEAR
+        first = np.where(apart, np.arange(len(geom)), first)
+        beside = []
+        for step in (-1, 1, -stride, stride):
+            key = (block + step) * n_geoms + geom
+            at = np.searchsorted(keys, key).clip(0, len(keys) - 1)
+            beside.append(np.where(keys[at] == key, example[at], first))
+        return cls(first, np.stack(beside, axis=1))
+
+    def among(self, chosen: np.ndarray) -> _Shared:
+        """The same among the chosen points (n,) bool, which share rays with chosen points only."""
+        new = np.cumsum(chosen) - 1
+        return _Shared(new[self.first[chosen]], new[self.beside[chosen]])
 
 
 def _cosine_to_light(
-    stage: Stage, light: np.ndarray, points: np.ndarray, normal: np.ndarray, representatives: np.ndarray | None = None
+    stage: Stage, light: np.ndarray, points: np.ndarray, normal: np.ndarray, shared: _Shared | None = None
 ) -> np.ndarray:
     """Cosine (n,) float32 of the angle between normal and light direction at points (n, 3), 0 in shadow.
 
-    A point is in shadow if its representative (n,) is.
+    With `shared`, a point is in shadow if the first point of its block is. At the border of a shadow, where a block
+    beside differs, each point has its own ray.
     """
     ray = points - light
     cosine = -_dot(ray, normal) / np.sqrt(_dot(ray, ray))
-    if representatives is not None:
-        own = np.unique(representatives)
+    if shared is not None:
+        own = np.unique(shared.first)
         _, distance, _ = stage.cast(light, ray[own], SHADOW_GROUPS)
         clear = np.zeros(len(points), bool)
         clear[own] = (distance < 0) | (distance > 1.0 - 1e-6)
-        return np.where(clear[representatives], np.maximum(cosine, 0.0), 0.0).astype(np.float32)
+        border = (clear[shared.beside] != clear[shared.first][:, None]).any(axis=1) & (cosine > 0)
+        border = np.flatnonzero(border & (shared.first != np.arange(len(points))))
+        _, distance, _ = stage.cast(light, ray[border], SHADOW_GROUPS)
+        clear = clear[shared.first]
+        clear[border] = (distance < 0) | (distance > 1.0 - 1e-6)
+        return np.where(clear, np.maximum(cosine, 0.0), 0.0).astype(np.float32)
     lit = np.flatnonzero(cosine > 0.0)
     _, distance, _ = stage.cast(light, ray[lit], SHADOW_GROUPS)
     visible = (distance < 0) | (distance > 1.0 - 1e-6)
@@ -149,10 +176,13 @@ class LightMap:
 
 
 class BodyColours:
-    """Colours of points on objects and on the finger, seen from the camera at `eye` (3,)."""
+    """Colours of points on objects and on the finger, seen from the camera at `eye` (3,).
 
-    def __init__(self, stage: Stage, atlas: Atlas, room: Room, eye: np.ndarray) -> None:
-        self._stage, self._atlas, self._room, self._eye = stage, atlas, room, eye
+    Blocks of pixels have numbers; `stride` is the difference of the numbers from one row of blocks to the next.
+    """
+
+    def __init__(self, stage: Stage, atlas: Atlas, room: Room, eye: np.ndarray, stride: int) -> None:
+        self._stage, self._atlas, self._room, self._eye, self._stride = stage, atlas, room, eye, stride
         #: Of each surface of the world, the index of its first piece among the pieces of its body.
         self._first_piece: list[int] = []
         for shape in stage.world.shapes:
@@ -175,7 +205,7 @@ class BodyColours:
         highlight = np.clip(_dot(_unit(middle), smooth), 0, 1).astype(np.float32) ** 40
         # Light reflected by the table reaches surfaces that face down or sideways, less near the table.
         bounce = ((0.5 - 0.5 * smooth[:, 2]) * np.clip(points[:, 2] / 0.05, 0.35, 1)).astype(np.float32)
-        shared = _representatives(block, geom, points) if self._stage.world.has_meshes else None
+        shared = _Shared.of(block, self._stride, geom, points) if self._stage.world.has_meshes else None
         off_surface = (points + _LIFT * normal).astype(np.float32)
         lamp, sky = self._light(instance, off_surface, smooth.astype(np.float32), shared)
         reflected = bounce[:, None] * (np.float32(0.55 / 0.6) * room.rim)
@@ -220,13 +250,12 @@ class BodyColours:
         return albedo, gloss, smooth
 
     def _light(
-        self, instance: np.ndarray, points: np.ndarray, normal: np.ndarray, shared: np.ndarray | None
+        self, instance: np.ndarray, points: np.ndarray, normal: np.ndarray, shared: _Shared | None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Light (n, 3) from the lamp, and light (n, 3) from the ceiling, at points (n, 3)."""
         room, finger = self._room, instance == FINGER_ID
-        among_others = None
-        if shared is not None:  # no point of the finger represents another body, and the reverse
-            among_others = (np.cumsum(~finger) - 1)[shared[~finger]]
+        # Points of the finger share no rays with other bodies.
+        among_others = None if shared is None else shared.among(~finger)
         lamp, sky = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)
         for light in room.lamp:
             lamp += _cosine_to_light(self._stage, light, points.astype(float), normal, shared)

@@ -46,19 +46,22 @@ _SMALLEST, _LARGEST = 0.01, 0.6  # longest side of an object on a table, metres
 _MOST_FACES = 500_000
 _DOUBTFUL = 0.97  # objects of an index with a smaller agreement of rays are left out
 _SIZES = (0.8, 1.3)  # of objects of an index, times the size as given
+_SHORT, _LONG = 0.04, 0.32  # longest side of an object of an index, metres
+_COMMON = ("box", "can", "bottle", "cup", "bowl")  # drawn twice as often
+_LARGE = 0.3  # longest side from which an object is drawn half as often, metres
 _UPRIGHT, _ON_A_SIDE, _ANY = 0.70, 0.25, 0.05
 
 _FINISHES: Mapping[str, tuple[str, ...]] = {
-    "box": ("carton",),
+    "box": ("carton", "carton", "plain"),
     "can": ("label",),
     "bottle": ("label", "plain"),
-    "cup": ("ceramic",),
-    "bowl": ("ceramic",),
-    "plate": ("ceramic",),
+    "cup": ("glazed", "glazed", "ceramic"),
+    "bowl": ("glazed", "glazed", "ceramic"),
+    "plate": ("glazed", "glazed", "ceramic"),
     "tool": ("metal", "plain"),
     "cutlery": ("metal",),
-    "ornament": ("ceramic", "wood", "plain"),
-    "other": ("plain", "wood", "speckle"),
+    "ornament": ("wood", "plain"),
+    "other": ("plain", "plain", "wood"),
 }
 
 
@@ -103,7 +106,7 @@ class MeshObject:
         # Wood, filled packages and porcelain: 0.7 g a cubic centimetre of the body, thin walls are denser.
         thin = surface.volume / float(8 * np.prod(surface.half)) < 0.15
         mass = float(np.clip((2000.0 if thin else 700.0) * volume, 0.02, 1.5))
-        return Shape.of_surface(surface, scale, self.kind, self.name, mass, _finish(self.kind, surface.half))
+        return Shape.of_surface(surface, scale, self.kind, self.name, mass, _finish(self.kind, surface.half, thin))
 
 
 @functools.lru_cache(maxsize=512)
@@ -111,8 +114,13 @@ def _prepared(triangles: Triangles) -> MeshSurface:
     return prepared_mesh(triangles, cache_folder() / "objects", AGREEMENT)
 
 
-def _finish(kind: str, half: np.ndarray) -> tuple[str, ...]:
-    """Styles of texture of an object without colours. Labels need an object that is as wide as deep."""
+def _finish(kind: str, half: np.ndarray, thin: bool) -> tuple[str, ...]:
+    """Styles of texture of an object without colours.
+
+    Labels need an object that is as wide as deep. An open box, which has `thin` walls, has no print.
+    """
+    if kind == "box" and thin:
+        return ("plain",)
     round_ = 0.9 < half[0] / half[1] < 1.1
     found = _FINISHES.get(kind, _FINISHES["other"])
     return found if round_ or found != ("label",) else ("plain",)
@@ -162,9 +170,15 @@ class ObjectSet:
         counts = np.array([sum(one.source == source for one in objects) for source in sources])
         source = sources[int(rng.choice(len(sources), p=np.sqrt(counts) / np.sqrt(counts).sum()))]
         these = [one for one in objects if one.source == source]
-        chosen = these[int(rng.integers(len(these)))]
+        chosen = these[int(rng.choice(len(these), p=_frequencies(these)))]
         longest = 2 * float(chosen.half.max())
-        return chosen.shape(float(np.clip(rng.uniform(*_SIZES), 0.04 / longest, max(0.36 / longest, 0.5))))
+        return chosen.shape(float(np.clip(rng.uniform(*_SIZES), _SHORT / longest, max(_LONG / longest, 0.5))))
+
+
+def _frequencies(objects: list[MeshObject]) -> np.ndarray:
+    """How often each object is drawn: more often what is common on tables, less often what fills them."""
+    found = [(2.0 if one.kind in _COMMON else 1.0) * (0.5 if 2 * one.half.max() > _LARGE else 1.0) for one in objects]
+    return np.array(found) / sum(found)
 
 
 def find_folder(folder: str) -> Path:

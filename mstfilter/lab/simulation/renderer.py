@@ -66,7 +66,7 @@ class Renderer:
         rows, columns = np.indices((camera.height, camera.width)) // _BLOCK
         self._block = (rows * camera.width + columns).ravel()
         self._further = [self._rays + shift for shift in shifts] if supersample else []
-        self._bodies = BodyColours(self.stage, atlas, room, self._eye)
+        self._bodies = BodyColours(self.stage, atlas, room, self._eye, camera.width)
         self._render_background()
         fine = max(0.004, 2.0 / float(K[0, 0]))
         self._lamp_map, self._sky_map = LightMap(fine, room.lamp), LightMap(2 * fine, room.sky)

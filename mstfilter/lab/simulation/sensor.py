@@ -16,16 +16,21 @@ twice, are not modelled. Sources of the constants:
 - Xtion: 45 real frames; Khoshelham and Elberink, "Accuracy and resolution of Kinect depth data for indoor mapping
   applications", Sensors 12(2), 2012 (baseline, eighths of a pixel).
 - D415, D435: Intel RealSense D400 series datasheet (baselines 55 and 50 mm, horizontal fields of view 65 and 87
-  degrees at 1280 and 848 pixels, nearest distances 0.45 and 0.28 m), and Grunnet-Jepsen, Sweetser and Woodfill,
-  "Tuning depth cameras for best performance" (a root mean square error of 0.08 pixels of disparity).
-- Azure Kinect: hardware specification (narrow field of view 75 degrees, 0.5 to 3.86 m, standard deviation at most
+  degrees at 1280 and 848 pixels, nearest distance 0.45 m of the D415 at 1280 pixels). Intel's A. Grunnet-Jepsen in
+  IntelRealSense/librealsense, issues 3904 (errors of disparity of 0.08 pixels in practice and 0.032 at best) and 999
+  (nearest distance 0.17 m of the D435 at 848 pixels; 0.28 m is that at 1280 pixels). Disparity has 5 bits below a
+  pixel: Keselman, Woodfill, Grunnet-Jepsen and Bhowmik, "Intel RealSense stereoscopic depth cameras", CVPR
+  Workshops, 2017, of their predecessor.
+- Azure Kinect: Microsoft's hardware specification (narrow field of view: 0.5 to 3.86 m, standard deviation at most
   17 mm); Tölgyessy, Dekan, Chovanec and Hubinský, "Evaluation of the Azure Kinect and its comparison to Kinect v1 and
-  Kinect v2", Sensors 21(2), 2021, confirms this bound and describes flying pixels and dark materials.
-- L515: Intel RealSense LiDAR camera L515 datasheet (field of view 70 degrees, 0.25 to 9 m, standard deviation 2.5 mm
-  at 1 m on a surface that reflects 95 % of the light).
+  Kinect v2", Sensors 21(2), 2021, confirms this bound and describes flying pixels and dark materials. The focal
+  length is that of factory calibrations (0.49 of 1024 pixels; microsoft/Azure-Kinect-Sensor-SDK, issue 1617).
+- L515: Intel RealSense LiDAR camera L515 datasheet, revision 003 (field of view 70 degrees, 0.25 to 9 m, standard
+  deviation 2.5 mm at 1 m and 15.5 mm at 9 m on a surface that reflects 95 % of the light; ours is 22.5 mm at 9 m).
 
 Shares of lost and flying pixels, the darkest surface and the standard deviation of the Azure Kinect at 1 m are
-assumptions, except for the Xtion. The correlation of stereo noise is that of a matching window of about 7 pixels.
+assumptions, except for the Xtion; only the L515 loses the black ink of prints. The correlation of stereo noise is
+that of a matching window of about 7 pixels.
 
 The colour camera has optical blur, photon noise and the sRGB curve.
 
@@ -196,15 +201,15 @@ SENSORS: dict[str, DepthSensor] = {
     "xtion": DepthSensor(),
     "d415": DepthSensor(
         lateral=0.8, edge_dropout=0.25, fill=1.0, focal=615.0, baseline=0.055, quantum=0.019, noise=0.049,
-        correlation=1.5, flying=0.10, darkest=0.015, shiny=0.3, grazing=1.45, nearest=0.45, farthest=10.0,
+        correlation=1.5, flying=0.10, darkest=0.006, shiny=0.3, grazing=1.45, nearest=0.45, farthest=10.0,
     ),
     "d435": DepthSensor(
         lateral=1.2, edge_dropout=0.25, fill=1.0, focal=615.0, baseline=0.050, quantum=0.043, noise=0.110,
-        correlation=2.5, flying=0.15, darkest=0.015, shiny=0.3, grazing=1.45, nearest=0.28, farthest=10.0,
+        correlation=2.5, flying=0.15, darkest=0.006, shiny=0.3, grazing=1.45, nearest=0.17, farthest=10.0,
     ),
     "azure": DepthSensor(
         lateral=0.3, edge_dropout=0.30, fill=0.0, focal=505.0, baseline=0.0, axial=0.0015, flying=0.35,
-        darkest=0.03, shiny=0.5, grazing=1.4, nearest=0.5, farthest=3.86,
+        darkest=0.012, shiny=0.5, grazing=1.4, nearest=0.5, farthest=3.86,
     ),
     "l515": DepthSensor(
         lateral=0.3, edge_dropout=0.20, fill=0.0, focal=600.0, baseline=0.0, axial=0.0025, flying=0.20,

@@ -150,7 +150,7 @@ class Shape:
     ) -> Shape:
         """The shape of a mesh, `scale` times as large as the mesh."""
         pieces = tuple(placed(piece, np.eye(3), np.zeros(3), scale) for piece in surface.pieces)
-        print_as = "lathe" if finish[0] in ("label", "ceramic") else "box"
+        print_as = "lathe" if finish[0] in ("label", "ceramic", "glazed") else "box"
         rolling = 0.004
         return cls(family, name, pieces, mass, print_as, ((_UP_Z, 1.0),), finish, rolling, surface, scale)
 

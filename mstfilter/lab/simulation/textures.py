@@ -111,7 +111,8 @@ def draw_skin(rng: np.random.Generator, shape: Shape, pool: Pool = ANY) -> Skin:
     sizes = _chart_sizes(shape)
     pair = (printing.shade(rng, pool=pool), printing.shade(rng, (0.55, 0.95), 0.65, pool))
     words = printing.brand(rng, pool)
-    gloss = {"label": 0.30, "ceramic": 0.35, "carton": 0.12, "plain": 0.15, "metal": 0.40}.get(style, 0.04)
+    glosses = {"label": 0.30, "ceramic": 0.35, "glazed": 0.35, "carton": 0.12, "plain": 0.15, "metal": 0.40}
+    gloss = glosses.get(style, 0.04)
     if style == "carton":
         # Front and back are on the two broadest upright faces, the sides on the narrow ones.
         wide = sorted(range(4), key=lambda k: -sizes[k][0])[:2]
@@ -132,6 +133,12 @@ def draw_skin(rng: np.random.Generator, shape: Shape, pool: Pool = ANY) -> Skin:
         charts = [
             printing.glaze(rng, w, h, (pale, pair[0]), motif if k == _SIDE else 0) for k, (w, h) in enumerate(sizes)
         ]
+    elif style == "glazed":
+        # Of one colour: white, black or a hue.
+        kind = float(rng.uniform())
+        grey = int(rng.uniform(*((225, 250) if kind < 0.4 else (25, 60))))
+        tone = printing.shade(rng, (0.3, 0.95), 0.7, pool) if kind > 0.55 else (grey, grey, grey - 3)
+        charts = [printing.glaze(rng, w, h, (tone, tone), 0) for w, h in sizes]
     elif style == "wood":
         tone = printing.wood(rng, 0.01, 0.01)[0, 0]
         charts = [printing.wood(rng, w, h, (int(tone[0]), int(tone[1]), int(tone[2]))) for w, h in sizes]

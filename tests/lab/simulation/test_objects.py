@@ -243,6 +243,33 @@ def test_own_objects_rest_and_neither_sink_nor_fly(folder, seed):
     assert np.linalg.norm(scene.world.positions() - before, axis=1).max() < 0.5
 
 
+def test_objects_apart_stand_alone_and_in_view(folder):
+    """With `apart`, objects touch nothing, and all of each object is in the image."""
+    family = replace(scene_family("s1"), objects=str(folder), n_twins=0, n_stacked=0, apart=1.0, **TINY)
+    scene = SimulatedScene(family, 0)
+    _at_rest(scene)
+    assert scene.world.contacts() == []
+    for shape, pose in zip(scene.world.shapes, scene.world.poses(), strict=True):
+        corners = shape.corners @ pose[:3, :3].T + pose[:3, 3]
+        uv, _ = scene.camera.project(corners)
+        assert ((uv > -1) & (uv < (family.width, family.height))).all()
+    beside = SimulatedScene(replace(family, apart=0.0), 0).world.positions()[:, :2]
+    spread = [np.linalg.norm(p - p.mean(axis=0), axis=1).mean() for p in (scene.world.positions()[:, :2], beside)]
+    assert spread[0] > 1.3 * spread[1]
+
+
+def test_shared_shadow_rays_change_no_border_of_a_shadow(folder):
+    """Blocks of pixels share rays where no shadow ends. The reference has a ray for each point."""
+    family = replace(scene_family("s1"), objects=str(folder), n_twins=0, n_dropped=1, **TINY)
+    scene = SimulatedScene(family, 1)
+    shared = scene._renderer.render().colour
+    scene._renderer._block = np.arange(scene._renderer._block.size)
+    own = scene._renderer.render().colour
+    body = scene._renderer.render().instance > 0
+    differs = np.abs(shared - own).max(axis=-1)[body] > 0.02
+    assert body.any() and differs.mean() < 0.002  # blocks alone: .009
+
+
 @pytest.mark.nightly
 def test_a_scene_of_household_meshes_rests(shared_data, monkeypatch):
     monkeypatch.setenv("MSTFILTER_OBJECTS", str(shared_data("meshes")))
