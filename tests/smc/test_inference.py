@@ -416,7 +416,7 @@ def test_a_path_survives_if_all_free_particles_have_weight_zero():
     model = StateSpaceModel.of(Uniform(0.0, 1.0), lambda x: Uniform(x - 0.5, x + 0.5), lambda x: Normal(x, 1.0))
     filter = guided(model, lambda x, y: Normal(x, 2.0), 2)
     path, paths = np.array([0.5, 0.6, 0.7]), []
-    for seed in range(3000):
+    for seed in range(1500):
         path = conditional_path(filter, [0.5, 0.5, 0.5], seed, path)
         paths.append(path)
     # x_0 by the exact law, on a grid: p(x_0) times the likelihoods of all paths
@@ -425,7 +425,7 @@ def test_a_path_survives_if_all_free_particles_have_weight_zero():
     like = np.exp(-0.5 * (grid - 0.5) ** 2)
     law = ((grid >= 0) & (grid <= 1)) * like * (move @ (like * (move @ like)))
     mean = (grid * law).sum() / law.sum()
-    assert np.mean([p[0] for p in paths]) == pytest.approx(mean, abs=0.05)
+    assert np.mean([p[0] for p in paths]) == pytest.approx(mean, abs=0.07)
 
 
 @pytest.mark.parametrize("infer", [pmmh, ensemble, particle_gibbs])
