@@ -22,7 +22,8 @@ study lists the finished commands. If this file and the folder `rows` are commit
 A change of structure makes all results older. `--same` computes the hashes of `experiments/fingerprints` with the
 program of the results and with the present program. Where all agree, the results are current again, and `record.json`
 has the commit of the comparison as `equal`. A study whose own files have changed, or which depends on less than the
-whole program, has to run again. The hashes are of a few runs: a change that is meant to change results, even in a
+whole program, has to run again. Each program is asked by its own scripts, because modules have moved. The hashes are
+of a few runs: a change that is meant to change results, even in a
 rare case, needs the study.
 """
 
@@ -81,8 +82,16 @@ class Study:
     def is_made_by(self, root: Path) -> bool:
         """Whether the program in `root` made the results, with the present files of the study."""
         script = f"experiments/{self.name}"
-        made = self.record().get("program") == self.program(root)
-        return made and self.depends == PROGRAM and _hash(root, script) == _hash(REPOSITORY, script)
+        if self.depends != PROGRAM or _hash(root, script) != _hash(REPOSITORY, script):
+            return False
+        return self.record().get("program") in (self.program(root), self._program_then(root))
+
+    def _program_then(self, root: Path) -> str:
+        """The hash that the script of a copy of the repository computes: which files count has changed since."""
+        places = os.pathsep.join([str(root), str(root / "experiments")])
+        command = [sys.executable, "-c", f"import record; print(record.studies()[{self.name!r}].program())"]
+        done = subprocess.run(command, cwd=root, env={**os.environ, "PYTHONPATH": places}, capture_output=True)
+        return done.stdout.decode().strip()
 
     def is_current(self) -> bool:
         """Whether the present program made the results."""
@@ -150,9 +159,10 @@ def compare(older: list[Study]) -> None:
 
 
 def _fingerprints(root: Path, *arguments: Path | str) -> bool:
-    """Run the present script of the fingerprints with the packages of a copy of the repository."""
+    """Run the script of the fingerprints of a copy of the repository with the packages of this copy."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(root), str(root / "models")])}
-    command = [sys.executable, str(REPOSITORY / "experiments/fingerprints/run.py"), *map(str, arguments)]
+    environment.setdefault("MSTFILTER_SHARED", str(REPOSITORY.parent / "shared"))
+    command = [sys.executable, str(root / "experiments/fingerprints/run.py"), *map(str, arguments)]
     return subprocess.call(command, env=environment) == 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 from collections import defaultdict
 from pathlib import Path
 
@@ -14,7 +15,11 @@ from tests.conftest import REPOSITORY
 
 PACKAGE = REPOSITORY / "mstfilter"
 FILES = sorted(PACKAGE.rglob("*.py"))
-TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
+
+
+@functools.cache
+def trees() -> dict[Path, ast.Module]:
+    return {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
 
 
 def module_of(path: Path) -> str:
@@ -68,7 +73,7 @@ def source_of(module: str, name: str) -> str:
 
 def test_a_public_name_is_defined_once():
     where = defaultdict(list)
-    for path, tree in TREES.items():
+    for path, tree in trees().items():
         if "templates" not in path.parts:
             for name in public_definitions(tree):
                 where[name].append(module_of(path))
@@ -76,7 +81,9 @@ def test_a_public_name_is_defined_once():
 
 
 def test_no_module_imports_itself_through_others():
-    graph = nx.DiGraph([(module_of(path), other) for path, tree in TREES.items() for other in imported_modules(tree)])
+    graph = nx.DiGraph(
+        [(module_of(path), other) for path, tree in trees().items() for other in imported_modules(tree)]
+    )
     graph.remove_edges_from(nx.selfloop_edges(graph))
     assert [sorted(group) for group in nx.strongly_connected_components(graph) if len(group) > 1] == []
 
@@ -85,5 +92,5 @@ def test_no_module_imports_itself_through_others():
 def test_a_front_door_exports_what_its_modules_define(init):
     for name, module in exported(init).items():
         inner = MODULES[module]
-        assert name in public_definitions(TREES[inner]) or inner.name == "__init__.py", f"{module} {name}"
+        assert name in public_definitions(trees()[inner]) or inner.name == "__init__.py", f"{module} {name}"
         assert f"{module_of(init.with_suffix('.py'))}.{name}" not in MODULES, f"{name} is a module and a name"

@@ -37,6 +37,9 @@ COMMANDS = [
 ]
 
 
+FEW = ("n=2", "n_proposed=2")  # so that the runs are short
+
+
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
     """A folder with the data that the page uses."""
@@ -79,9 +82,9 @@ def test_commands_run(here, command, capsys):
     if words[0] == "convert" and (here / words[2]).exists():
         shutil.rmtree(here / words[2])
     if words[0] == "run":
-        words += ["--no-report", "n=2"]
+        words += ["--no-report", *FEW]
     if words[0] == "quality":
-        call("run", words[1].replace("run", "table"), "--out", words[1], "--no-report", "n=2", capsys=capsys)
+        call("run", words[1].replace("run", "table"), "--out", words[1], "--no-report", *FEW, capsys=capsys)
     code, out, err = call(*words, capsys=capsys)
     assert code == 0, err
     assert words[0] != "convert" or re.search(r"pauses +\d+ of \d+ frames: ", out)

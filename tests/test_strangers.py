@@ -246,7 +246,9 @@ def test_a_cache_of_recordings_is_private_with_any_umask(tmp_path):
     mask = os.umask(0o002)
     try:
         paths = {
-            cached_recording("demo", 0, tmp_path / "cache" / "recordings", n_actions=1, width=160, height=120)
+            cached_recording(
+                "demo", 0, tmp_path / "cache" / "recordings", n_actions=1, n_candidates=4, width=160, height=120
+            )
             for _ in range(2)
         }
     finally:
@@ -258,6 +260,7 @@ def test_a_cache_of_recordings_is_private_with_any_umask(tmp_path):
 
 def test_a_cached_recording_that_was_edited_is_simulated_again(tmp_path):
     small = {"width": 80, "height": 60, "n_actions": 1, "frames_per_clip": 3, "fps": 1.0, "supersample": False}
+    small["n_candidates"] = 4
     folder = cached_recording("s1", 0, tmp_path, **small)
     depth = folder / "depth" / "000000.png"
     before, stamp = depth.read_bytes(), depth.stat().st_mtime_ns

@@ -48,15 +48,19 @@ def shifted_camera(by=1.0):
     return changed(rgb=np.r_[arrays["rgb"][:1], rgb], depth=np.r_[arrays["depth"][:1], depth])
 
 
-def beyond_the_table(surface):
-    """The exact scene; `surface` gives the depth (H, W) of what is beyond the table from pose and directions."""
+def beyond_the_table(surface, matrix):
+    """The exact scene; `surface` gives the depth (H, W) of what is beyond the table from pose and directions.
+
+    `matrix` (3, 4) maps points of the world, in which the table is at z = 0, to the world of the pose that is given.
+    """
     pose = look_at((0.0, -0.9, 0.45), (0, 0, 0.2))
     camera = CAMERA.scaled(2).at(pose)
     rgb, depth, _ = table_scene(camera=camera)
     directions = camera.rays() @ pose.as_matrix()[:3, :3].T
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = surface(depth, camera, directions)
-    return {"rgb": rgb, "depth": depth.astype(np.float32), "K": camera.K}
+    wrong = RigidTransform.from_matrix(np.vstack([matrix, [0, 0, 0, 1]])) * pose
+    return {"rgb": rgb, "depth": depth.astype(np.float32), "K": camera.K, "T_world_camera": wrong}
 
 
 def wall(depth, camera, directions):
@@ -100,8 +104,10 @@ WRONG = {
     "images upside down, with a pose": lambda: posed(
         rgb=right()[0]["rgb"][:, ::-1, ::-1], depth=right()[0]["depth"][:, ::-1, ::-1]
     ),
-    "a wall taken for the table": lambda: beyond_the_table(wall),
-    "the floor taken for the table": lambda: beyond_the_table(floor),
+    "a pose with a wall at z = 0": lambda: beyond_the_table(wall, [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0.2]]),
+    "a pose with the floor at z = 0": lambda: beyond_the_table(
+        floor, np.eye(3, 4) + [[0] * 4, [0] * 4, [0, 0, 0, 0.7]]
+    ),
     "principal point at the corner": K_times(1, 1, 0, 1, 1, 0, 1, 1, 1),
     "principal point off the centre": K_times(1, 1, 0.4, 1, 1, 1, 1, 1, 1),
     "K of images of another size": K_times(2, 1, 2, 1, 2, 2, 1, 1, 1),

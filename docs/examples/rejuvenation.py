@@ -64,5 +64,6 @@ def exact(rng: np.random.Generator, n: int) -> tuple[Population | None, Populati
 if __name__ == "__main__":
     model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 1.0), lambda x: Normal(x, 1.0))
     filter = replace(bootstrap(model, n=1000), rejuvenation=MyRejuvenation())
-    state, infos = filter.run([0.3, -0.1, 0.8], seed=0)
-    print("mean", state.population.weights @ state.population.particles, "ESS", [round(info.ess) for info in infos])
+    states, observations = model.simulate(20, seed=1)
+    state, infos = filter.run(observations, seed=0)
+    print("mean", state.population.mean(), "ESS", [round(info.ess) for info in infos])

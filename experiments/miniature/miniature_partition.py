@@ -22,11 +22,12 @@ import numpy as np
 from miniature_mst import CutProposal, DepthFreeSpace
 from miniature_world import Miniature, Observation
 from scipy.optimize import minimize
+from scipy.spatial.transform import RigidTransform
 from scipy.special import expit
 
 from mstfilter.mst.completion import Completer, Completion
 from mstfilter.mst.partition import Cells, PairEvidence, PairOdds, PartitionUpdate
-from mstfilter.scene import Hypothesis, Occupancy, VoxelGrid, memo
+from mstfilter.scene import Camera, Hypothesis, Occupancy, VoxelGrid, memo
 from mstfilter.scene.support import Foreground
 from mstfilter.smc import ParticleFilter, Population, Systematic, Transition, Update
 
@@ -46,6 +47,11 @@ class RowImage:
     def key(self) -> bytes:
         """Content key."""
         return b"row" + self.observation.depth.tobytes()
+
+    @property
+    def camera(self) -> Camera:
+        """A camera of an image of one row. Only its size has a meaning."""
+        return Camera.from_intrinsics(1.0, 1.0, 0.0, 0.0, self.grid.shape[0], 1, RigidTransform.identity())
 
     @property
     def depth(self) -> np.ndarray:

@@ -29,7 +29,7 @@ from mstfilter.base.files import read_csv, write_csv
 from mstfilter.base.trained import open_model, write_model
 from mstfilter.mst.segmentation import BorderTree
 from mstfilter.runs.presets import preset
-from mstfilter.scene import Clip, Hypothesis, project
+from mstfilter.scene import Clip, Hypothesis, outlined, project
 from mstfilter.scoring.statistics import compare
 from mstfilter.smc import State
 
@@ -105,6 +105,9 @@ def run(
             particles = states[name].population.particles
             images = [project(h, clip.after.camera) for h in particles]
             rows = [image_scores(image, truth, clip.after, clip.grid) for image in images]
+            for row, h in zip(rows, particles, strict=True):
+                cut = image_scores(outlined(h, clip.after), truth, clip.after, clip.grid)
+                row["quality_outlined"] = cut["quality"]
             if sequence.witness is not None:
                 pairs = zip(rows, particles, strict=True)
                 rows = [row | witness_scores(h, clip.after, sequence.witness(clip.index)) for row, h in pairs]

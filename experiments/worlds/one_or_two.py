@@ -36,8 +36,8 @@ import numpy as np
 
 import mstfilter
 from mstfilter.base.errors import InputError
-from mstfilter.base.files import write_csv
-from mstfilter.lab.simulation import cache_folder, cached_recording, part_image
+from mstfilter.base.files import cache_folder, write_csv
+from mstfilter.lab.simulation import cached_recording, part_image
 from mstfilter.mst.partition.cells import Readings
 from mstfilter.scene import Clip, Recording, foreground, scaled_area
 from mstfilter.scoring.forecasts import SOFTENING, ForecastTable

@@ -192,7 +192,7 @@ class _Run:
             tensors = open_model(settings.start, settings.architecture).tensors
             self.networks["net"].load_state_dict({name: torch.from_numpy(value) for name, value in tensors.items()})
         self.averaged = copy.deepcopy(self.networks["net"])
-        self.parameters = [p for network in self.networks.values() for p in network.parameters()]
+        self.parameters = [p for network in self.networks.values() for p in network.parameters() if p.requires_grad]
         self.optimiser = torch.optim.AdamW(self.parameters, lr=settings.rate, weight_decay=0.01)
         self.step = 0
         self.curves: list[dict[str, float]] = []

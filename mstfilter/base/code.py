@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import ast
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from pathlib import Path
+
+_Documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
 
 
 @lru_cache(maxsize=2000)
@@ -23,14 +25,21 @@ def code_of(source: bytes) -> bytes:
         tree = ast.parse(source)
     except (SyntaxError, ValueError):
         return source
-    for node in ast.walk(tree):
-        match node:
-            case ast.Module() | ast.ClassDef() | ast.FunctionDef() | ast.AsyncFunctionDef() if ast.get_docstring(
-                node
-            ):
-                del node.body[0]
+    for node in _documented(tree):
+        if ast.get_docstring(node, clean=False):
+            del node.body[0]
     tree.body = [node for node in tree.body if not _is_version(node)]
     return ast.dump(tree).encode()
+
+
+def _documented(tree: ast.AST) -> Iterator[_Documented]:
+    """The module, the classes and the functions of a tree; they stand in statements, so expressions are left out."""
+    if isinstance(tree, _Documented):
+        yield tree
+    for name in ("body", "orelse", "finalbody", "handlers", "cases"):
+        found = getattr(tree, name, ())
+        for node in found if isinstance(found, list) else ():
+            yield from _documented(node)
 
 
 def _is_version(node: ast.stmt) -> bool:

@@ -207,6 +207,13 @@ def make_folders(folder: Path, mode: int = 0o777) -> list[Path]:
     return missing
 
 
+def cache_folder() -> Path:
+    """Folder of cached files: the variable MSTFILTER_CACHE, or else `mstfilter` in the user's cache folder."""
+    if folder := os.environ.get("MSTFILTER_CACHE"):
+        return Path(folder)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mstfilter"
+
+
 def _sync(target: Path, *paths: Path) -> None:
     """Wait until the contents of files and folders are stored on the disk.
 

@@ -28,7 +28,7 @@ from mstfilter.base.resources import models_folder
 
 WEIGHTS, DESCRIPTION = "weights.safetensors", "model.toml"
 _MOST_FEATURES = 2**16  # of a layer
-_HINT = "train it with: mstfilter train completion or border --out FOLDER; others are written by write_model"
+_HINT = "train it with: mstfilter train completion, border or seams --out FOLDER; others are written by write_model"
 
 
 @contextlib.contextmanager

@@ -41,13 +41,26 @@ from mstfilter.base.files import (
 from mstfilter.base.reading import MAX_FILE, read_arrays, read_model
 from mstfilter.formats import read_labels, read_rgb, write_image
 from mstfilter.formats.folder import CameraFile
-from mstfilter.scene import Camera, Clip, Hypothesis, as_labels, decode_hypotheses, encode_hypotheses, memo
+from mstfilter.mst.belief import Belief
+from mstfilter.scene import (
+    Camera,
+    Clip,
+    Hypothesis,
+    WeightedSegmentations,
+    as_labels,
+    decode_hypotheses,
+    encode_hypotheses,
+    memo,
+)
 from mstfilter.scoring import FORMS, PauseEstimate, Questions, weighted_coverage
 from mstfilter.smc import Codec, Info, State, load_state, save_state
 
 _FORMAT = 2
+_SEGMENTATIONS = "segmentations"  # note of an update, see `PartitionUpdate`
 _RESUME = "repeat the command that made the run, to resume it"
-_PAUSE_FILES = rf"(rgb\.png|instance\.png|camera\.json|state\.npz|truth\.npz|info\.json|seconds\.json|{SUMS})"
+_PAUSE_FILES = (
+    rf"(rgb\.png|instance\.png|camera\.json|state\.npz|truth\.npz|segmentations\.npz|info\.json|seconds\.json|{SUMS})"
+)
 _TABLES = rf"(run\.json|metrics\.csv|(report|view)\.html|result\.json|forecasts\.npz|{SUMS})"
 RUN_FILES = re.compile(rf"(compare/[^/]+/)?(pauses/\d+/{_PAUSE_FILES}|{_TABLES})")  #: paths in a run folder
 
@@ -208,7 +221,7 @@ class RunFolder:
         """Check the files of pause `t` after a pause with `n_before` hypotheses. Returns the number of hypotheses."""
         folder, info, hypotheses = self.pause(t), self.info(t), self.hypotheses(t)
         grid, camera, image, labels = hypotheses[0].grid, self.camera(t), self.rgb(t), self.truth(t)
-        _ = self.seconds(t), self.questions(t)
+        _ = self.seconds(t), self.questions(t), self.segmentations(t)
         parents, quality = info["parents"], info["quality"]
         if quality is None:  # no ground truth
             quality = dict.fromkeys(FORMS, info["weights"])
@@ -287,7 +300,11 @@ class RunFolder:
             record |= {
                 name: getattr(population, name) for name in ("unique_ancestors", "parents", "log_weights", "weights")
             }
-            record |= {"n_frames": len(clip), "quality": quality, "notes": info.notes}
+            notes = {slot: dict(found) for slot, found in info.notes.items()}
+            seen = notes.get("update", {}).pop(_SEGMENTATIONS, None)
+            if seen is not None:
+                np.savez_compressed(folder / f"{_SEGMENTATIONS}.npz", **seen.arrays())
+            record |= {"n_frames": len(clip), "quality": quality, "notes": notes}
             write_json(folder / "info.json", record)
             write_sums(folder)
             write_json(folder / "seconds.json", info.seconds)
@@ -388,6 +405,21 @@ class RunFolder:
             now = path.stat()
         version = (str(path.resolve()), now.st_mtime_ns, now.st_size)
         return memo("state of a run", version, lambda: load_state(path, HypothesisCodec(), limit=MAX_FILE))
+
+    def segmentations(self, t: int) -> WeightedSegmentations | None:
+        """All weighted segmentations of the image of pause `t`; None if the update of the filter has none."""
+        path = self.pause(t) / f"{_SEGMENTATIONS}.npz"
+        if not path.is_file():
+            return None
+        arrays = read_arrays(path, "the segmentations of a pause")
+        with reading(path, "the segmentations of a pause"):
+            return WeightedSegmentations.of_arrays(arrays)
+
+    def belief(self, t: int) -> Belief:
+        """The belief after pause `t`: the hypotheses, and the weighted segmentations of its image."""
+        population = self.state(t).population
+        assert population is not None
+        return Belief(population, self.segmentations(t))
 
     def estimates(self) -> list[PauseEstimate]:
         """The weighted hypotheses of all pauses, for `mstfilter.scoring.score_pauses`."""

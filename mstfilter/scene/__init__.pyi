@@ -33,20 +33,32 @@ from mstfilter.scene.frame import (
     grey_blocks as grey_blocks,
 )
 from mstfilter.scene.geometry import (
-    BASELINE as BASELINE,
-    TABLE_TOLERANCE as TABLE_TOLERANCE,
-    fit_support_plane as fit_support_plane,
     frame_geometry as frame_geometry,
     frame_points as frame_points,
-    table_residual as table_residual,
+)
+from mstfilter.scene.heights import (
+    above_table as above_table,
+    fill_from_nearest as fill_from_nearest,
+    filled_above_table as filled_above_table,
+    pixels_above_table as pixels_above_table,
+    posed_camera as posed_camera,
+    readings_above_table as readings_above_table,
 )
 from mstfilter.scene.occupancy import Occupancy as Occupancy
+from mstfilter.scene.outlines import outlined as outlined
 from mstfilter.scene.partitions import (
     CommonRefinement as CommonRefinement,
+    WeightedSegmentations as WeightedSegmentations,
     canonical as canonical,
     common_refinement as common_refinement,
 )
 from mstfilter.scene.pauses import PauseRule as PauseRule, pauses_with_depth as pauses_with_depth
+from mstfilter.scene.planes import (
+    BASELINE as BASELINE,
+    TABLE_TOLERANCE as TABLE_TOLERANCE,
+    fit_support_plane as fit_support_plane,
+    table_residual as table_residual,
+)
 from mstfilter.scene.plausibility import (
     Finding as Finding,
     Look as Look,
@@ -67,17 +79,7 @@ from mstfilter.scene.rendering import (
     render as render,
     render_hypothesis as render_hypothesis,
 )
-from mstfilter.scene.support import (
-    Foreground as Foreground,
-    above_table as above_table,
-    fill_from_nearest as fill_from_nearest,
-    filled_above_table as filled_above_table,
-    foreground as foreground,
-    pixel_graph as pixel_graph,
-    pixels_above_table as pixels_above_table,
-    posed_camera as posed_camera,
-    readings_above_table as readings_above_table,
-)
+from mstfilter.scene.support import Foreground as Foreground, foreground as foreground, pixel_graph as pixel_graph
 from mstfilter.scene.voxels import (
     MAX_LABEL as MAX_LABEL,
     Crop as Crop,

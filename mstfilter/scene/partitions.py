@@ -9,14 +9,20 @@ There are far fewer cells than voxels.
 >>> both.objects                       # numbered over both segmentations
 array([[0, 1, 2],
        [0, 3, 3]])
+
+`WeightedSegmentations` are many segmentations of one image with probabilities, stored by their cells.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+
+from mstfilter.base.errors import InputError
+from mstfilter.scene.camera import Camera, rigid_from_matrix
 
 
 def canonical(labels: np.ndarray) -> np.ndarray:
@@ -86,6 +92,80 @@ def common_refinement(segmentations: Sequence[np.ndarray]) -> CommonRefinement:
     for row, numbers in zip(objects, numbered, strict=True):
         row[1:] = numbers[example[1:]]
     return CommonRefinement(cells, objects, np.bincount(cells.ravel(), minlength=k), first)
+
+
+@dataclass(frozen=True, eq=False)
+class WeightedSegmentations:
+    """Segmentations of one image with their weights.
+
+    >>> camera = Camera.from_intrinsics(500, 500, 1, 0, 3, 1, RigidTransform.identity())
+    >>> cells, one, two = np.array([[0, 1, 2]]), [1, 1], [1, 2]
+    >>> ways = WeightedSegmentations(cells, np.array([one, two]), np.array([0.4, 0.6]), camera)
+    >>> ways.refinement.cells, ways.are_of(camera)
+    (array([[0, 1, 2]]), True)
+
+    Raises InputError if the shapes, labels or weights do not fit together.
+    """
+
+    cells: np.ndarray  #: (H, W) int, cell 1 .. K of each pixel; 0 for pixels of no object
+    labels: np.ndarray  #: (m, K) int, segment of each cell in each segmentation; 0 is no object
+    weights: np.ndarray  #: (m,) float, sum 1
+    camera: Camera  #: of the image, with its pose
+
+    def __post_init__(self) -> None:
+        m, k = self.labels.shape if self.labels.ndim == 2 else (-1, -1)
+        if self.cells.ndim != 2 or self.weights.shape != (m,) or int(self.cells.max(initial=0)) > k:
+            raise InputError(
+                f"segmentations have cells {self.cells.shape}, labels {self.labels.shape} and weights "
+                f"{self.weights.shape}, expected (H, W), (m, K) with a column for each cell, and (m,)"
+            )
+        if self.cells.shape != (self.camera.height, self.camera.width):
+            raise InputError(
+                f"segmentations have cells {self.cells.shape}, and the image of their camera has "
+                f"{(self.camera.height, self.camera.width)}"
+            )
+        if min(self.cells.min(initial=0), self.labels.min(initial=0)) < 0:
+            raise InputError("segmentations have negative cells or labels")
+        if not (self.weights >= 0).all() or not abs(float(self.weights.sum()) - 1) < 1e-6:
+            raise InputError(f"the weights of segmentations sum to {float(self.weights.sum())}, expected 1")
+
+    def __repr__(self) -> str:
+        return f"WeightedSegmentations: {len(self.labels)} of {self.labels.shape[1]} cells"
+
+    @cached_property
+    def refinement(self) -> CommonRefinement:
+        """The segmentations as a common refinement."""
+        numbered = [canonical(row).astype(np.int64) for row in self.labels]
+        first = np.cumsum([0, *(int(row.max(initial=0)) for row in numbered)])
+        rows = [np.where(row > 0, row + before, 0) for row, before in zip(numbered, first, strict=False)]
+        objects = np.pad(np.array(rows).reshape(self.labels.shape), ((0, 0), (1, 0)))
+        cells = self.cells.astype(np.int64)
+        return CommonRefinement(cells, objects, np.bincount(cells.ravel(), minlength=objects.shape[1]), first)
+
+    def are_of(self, camera: Camera) -> bool:
+        """Whether the image is that of a camera: same size, intrinsics and pose, up to rounding."""
+        mine, theirs = self.camera, camera
+        return bool(
+            (mine.width, mine.height) == (theirs.width, theirs.height)
+            and np.allclose(mine.K, theirs.K, rtol=1e-6)
+            and theirs.T_world_camera is not None
+            and np.allclose(mine.pose.as_matrix(), theirs.pose.as_matrix(), atol=1e-6)
+        )
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arrays by name, in small types."""
+        cells, labels = (
+            values.astype(np.min_scalar_type(int(values.max(initial=0)))) for values in (self.cells, self.labels)
+        )
+        pose = self.camera.pose.as_matrix()
+        return {"cells": cells, "labels": labels, "weights": self.weights, "K": np.array(self.camera.K), "pose": pose}
+
+    @classmethod
+    def of_arrays(cls, arrays: Mapping[str, np.ndarray]) -> WeightedSegmentations:
+        """The segmentations of `arrays`."""
+        cells, labels, weights = (np.asarray(arrays[name]) for name in ("cells", "labels", "weights"))
+        height, width = cells.shape
+        return cls(cells, labels, weights, Camera(arrays["K"], width, height, rigid_from_matrix(arrays["pose"])))
 
 
 def _renumbered(codes: np.ndarray) -> tuple[int, np.ndarray]:

@@ -22,7 +22,7 @@ from mstfilter.scene.alignment import MIN_MOVED, Corners, Edges, edge_agreement
 from mstfilter.scene.arrays import content_key
 from mstfilter.scene.camera import Camera
 from mstfilter.scene.frame import Frame, depth_sigma
-from mstfilter.scene.geometry import ON_TABLE, Plane, plane_of, sampled, table_of
+from mstfilter.scene.planes import ON_TABLE, Plane, plane_of, sampled, table_of
 from mstfilter.scene.voxels import VoxelGrid
 
 _FIELDS, _POSSIBLE_FIELDS = (12.0, 130.0), (3.0, 160.0)  # degrees: horizontal field of view; warning and stop
@@ -99,6 +99,11 @@ class Look:
         """(n,) bool: whether each depth reading is on the table."""
         return np.asarray(np.abs(self.points[:, 2]) < ON_TABLE)
 
+    @property
+    def everything(self) -> np.ndarray:
+        """(n,) bool: all depth readings."""
+        return np.ones(len(self.points), bool)
+
     @cached_property
     def table(self) -> Plane | None:
         """The plane of the table; None if no plane is found near z = 0."""
@@ -174,7 +179,7 @@ def _repeated(looks: Sequence[Look]) -> Iterator[Finding]:
 
 def _pose(first: Look) -> Iterator[Finding]:
     """Findings if the depth readings at the first pause contradict the pose: their table is not at z = 0."""
-    camera, table, free = first.frame.camera, first.table, plane_of(first.frame)
+    camera, table, free = first.frame.camera, first.table, plane_of(first.frame, first.everything)
     hints = (
         "check the pose: z of the world is up, the table is at z = 0; without a pose it is found from the table",
         "T_world_camera maps points of the camera to the world; is this the inverse?",
@@ -193,14 +198,19 @@ def _pose(first: Look) -> Iterator[Finding]:
 
 
 def _other_support(first: Look) -> Iterator[Finding]:
-    """Findings if a wall or the floor is at z = 0, because a pose was found there, and another plane is the table.
+    """Findings if a wall or the floor is at z = 0, and another plane is the table.
 
-    A table is parallel to the floor, and its height above the floor is larger than the height of an object. A table
-    is at a right angle to a wall and extends far from the wall. In the image, the normal of a table points up, and
-    the normal of a wall does not.
+    The table of the depth image, found without the pose, is then not at z = 0 either. A table is parallel to the
+    floor, and its height above the floor is larger than the height of an object. A table is at a right angle to a
+    wall and extends far from the wall. In the image, the normal of a table points up, and that of a wall does not.
     """
     raised = first.points[:, 2] > ON_TABLE
-    plane = plane_of(first.frame, raised) if raised.mean() > _MIN_ON_TABLE else None
+    if raised.mean() < _MIN_ON_TABLE:
+        return
+    found = plane_of(first.frame)
+    if found is not None and found.tilt < 2 * _MAX_TILT and abs(found.height) < 2 * _MAX_HEIGHT:
+        return
+    plane = plane_of(first.frame, raised)
     if plane is None:
         return
     hint = "or remove the depth readings beyond the table (NaN or 0), or turn the camera towards the table"

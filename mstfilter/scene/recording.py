@@ -29,8 +29,9 @@ from mstfilter.scene.arrays import content_key
 from mstfilter.scene.camera import Camera
 from mstfilter.scene.frame import Clip, Frame
 from mstfilter.scene.from_arrays import cameras_of, images_of, masks_of, seconds_of
-from mstfilter.scene.geometry import fit_support_plane, table_height, workspace
+from mstfilter.scene.geometry import workspace
 from mstfilter.scene.pauses import PauseRule, indices_of, pauses_with_depth, rule_for
+from mstfilter.scene.planes import fit_support_plane, table_height
 from mstfilter.scene.plausibility import examine, report_findings, unreadable
 from mstfilter.scene.voxels import VoxelGrid, as_labels
 

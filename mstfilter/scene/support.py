@@ -4,12 +4,14 @@
 >>> found.pixels                        # (H, W) bool, may belong to an object
 >>> found.frame.depth                   # metres, estimated where a pixel of an object has no reading of it
 
-Pixels with a depth reading are classified by depth. Isolated readings above the table are noise, and so are small
-and low regions with the colour of the table. Other connected regions of readings are objects. Dark or shiny surfaces
+Pixels with a depth reading are classified by depth (`mstfilter.scene.heights`). Isolated readings above the table are
+noise, and so are low readings with the colour of the table: cloth, glare, and the depth that sensors smear from an
+object into the table. Walls and things beside the table are no objects. Other connected regions of readings are
+objects. Dark or shiny surfaces
 often have no readings. A pixel without a reading belongs to an object if its colour differs from the nearby table.
 Near the outline of an object, depth images have errors of several pixels. There, the colours of the object and of the
 table decide. A region of another colour with readings on the table is a flat object if it is higher than the table
-around it. The table is the plane z = 0 if the camera has a pose, else the plane with the most depth readings.
+around it.
 """
 
 from __future__ import annotations
@@ -25,13 +27,21 @@ from scipy.sparse.linalg import spsolve
 
 from mstfilter.scene.arrays import read_only
 from mstfilter.scene.cache import memo
-from mstfilter.scene.camera import Camera, scaled_area, scaled_length
+from mstfilter.scene.camera import scaled_area, scaled_length
 from mstfilter.scene.frame import Frame
-from mstfilter.scene.geometry import BASELINE, TABLE_TOLERANCE, fit_support_plane, table_residual
+from mstfilter.scene.heights import (
+    above_table,
+    filled_above_table,
+    height_in_noise,
+    pixels_above_table,
+    posed_camera,
+    readings_above_table,
+    surroundings,
+)
+from mstfilter.scene.planes import BASELINE, TABLE_TOLERANCE, beyond_table
 from mstfilter.scene.voxels import VoxelGrid
 
 # Areas and lengths are those of an image of 640 x 480 pixels.
-_DENSE = 0.8  # share of readings beside a reading: with less, depth has holes everywhere
 _FEW_BESIDE = 0.1  # share of readings around a reading: with less, the reading is noise
 _SMALLEST = 25  # pixels of a region of readings
 _RISE = 1.75  # mean rise of a region of readings, in tolerances
@@ -46,13 +56,16 @@ _HOLE = 0.9  # share of the readings around a hole in an object that are reading
 _SOLID, _GLARE = 8.0, 2.0  # radius of a solid gap, pixels; brightness of glare in standard deviations of the table
 _STEP, _SHADOW = 0.02, 1.2  # smallest step of depth in metres; tolerance of the width of a shadow
 _EDGE = 9  # pixels around the end of a gap that may have cast a shadow
-_FINE = 20.0  # pixels: means over less than this are computed at half of the resolution, others at a quarter
 _FEW_NEAR = 1e-3  # share of the core of objects around a pixel that shows their colours
 _NARROW = 6.0  # pixels between a reading and an estimate that is this reading
 _FEW = 10  # readings of an object that do not determine the depth of its other pixels
 _STANDS = 0.004  # metres: least height of estimated readings above the table, without a grid
 _LAYER = 0.75  # the same in voxels of the grid: at least one layer of voxel centres lies inside a flat object
-_LOW, _SMALL = 6.0, 500  # mean rise in sensor units, and pixels, of noise with the colour of the table
+_LOW = 6.0  # rise of noise with the colour of the table, in units of noise
+_LIKE_TABLE = 3.0  # squared distance of such a colour
+# The same beside an object: rise, squared distance of colour, least log odds of the table per unit of noise.
+_SMEARED, _SHADED, _DOUBT = 30.0, 6.0, 0.8
+_PLATE = 0.7  # share of the readings around the inside of a plate that are higher
 _SAME_COLOUR, _OTHER_COLOUR = 2.0, 0.25  # squared distance of the colour of the table; share of pixels above it
 _OUTLINE = 6.0  # pixels on both sides of an outline that are assigned by colour
 _CORE = 2.0  # pixels between an outline and the core of an object
@@ -69,47 +82,6 @@ class Foreground:
 
     pixels: np.ndarray  #: (H, W) bool
     frame: Frame  #: the frame, with estimated depth at pixels without a reading of the object
-
-
-def above_table(frame: Frame) -> np.ndarray:
-    """Disparity minus the disparity of the table, (H, W) float32 in sensor units; NaN at pixels without a reading.
-
-    One sensor unit is 1/8 px at f = 525 px, or 3.2 mm of depth at 1 m.
-    """
-    return fit_support_plane(frame).residual if frame.camera.T_world_camera is None else table_residual(frame)
-
-
-def filled_above_table(frame: Frame) -> np.ndarray:
-    """The values of `above_table`. For a sparse sensor, missing pixels take the value of the nearest reading."""
-    height = above_table(frame)
-    beside = cv2.blur(frame.valid.astype(np.float32), (3, 3))[frame.valid]
-    return fill_from_nearest(height, ~frame.valid) if len(beside) and beside.mean() < _DENSE else height
-
-
-def fill_from_nearest(depth: np.ndarray, holes: np.ndarray) -> np.ndarray:
-    """Depth (H, W) in which each pixel of `holes` (H, W) bool has the depth of the nearest reading."""
-    if not holes.any() or holes.all():
-        return depth
-    rows, columns = ndimage.distance_transform_edt(holes, return_distances=False, return_indices=True)
-    return np.asarray(depth[rows, columns])
-
-
-def posed_camera(frame: Frame) -> Camera:
-    """The camera of a frame. A missing pose is computed relative to the fitted table (`fit_support_plane`)."""
-    camera = frame.camera
-    return camera if camera.T_world_camera is not None else camera.at(fit_support_plane(frame).T_world_camera)
-
-
-def pixels_above_table(frame: Frame) -> np.ndarray:
-    """Pixels (H, W) that have a reading above the table and do not show the robot."""
-    with np.errstate(invalid="ignore"):
-        return frame.valid & (above_table(frame) > TABLE_TOLERANCE)
-
-
-def readings_above_table(frame: Frame, grid: VoxelGrid | None = None) -> np.ndarray:
-    """The `pixels_above_table` (H, W) bool with a reading in the grid. Without a grid, no pixel is excluded."""
-    pixels = pixels_above_table(frame)
-    return pixels if grid is None else pixels & grid.contains(grid.index_of(frame.points))
 
 
 def foreground(frame: Frame, grid: VoxelGrid | None = None) -> Foreground:
@@ -169,14 +141,28 @@ class _Colours:
         deviation = (lab - mean) / np.sqrt(variance)
         return cls(table, lab, near, deviation[..., 0], (deviation**2).sum(axis=-1), np.log(variance).sum(axis=-1))
 
+    def like_object(self, core: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Share (H, W) of the core (H, W) bool of objects near each pixel, and log likelihood ratio of its colours.
+
+        The ratio (H, W) is that of two normal distributions: of the nearby core and of the nearby table.
+        """
+        share, mean, variance = _around(self.lab, core, _CORE_REACH)
+        distance = ((self.lab - mean) ** 2 / variance).sum(axis=-1)
+        log_ratio = 0.5 * (self.distance + self.log_variance - distance - np.log(variance).sum(axis=-1))
+        return share, log_ratio
+
 
 def _regions_of_readings(frame: Frame, grid: VoxelGrid | None, seen: _Colours) -> np.ndarray:
     """Pixels (H, W) bool of connected regions of readings above the table, without noise.
 
-    A small and low region with the colour of the table is noise.
+    A low region with the colour of the table is noise, whatever its size. The heights of pixels of another colour are
+    in sensor units, as two kinds of evidence are enough.
     """
-    raised = readings_above_table(frame, grid)
-    height = np.minimum(np.nan_to_num(filled_above_table(frame), posinf=1e3), 1e3)
+    coloured = seen.distance > _COLOUR_DISTANCE
+    height = np.where(coloured, filled_above_table(frame), height_in_noise(frame, filled=True))
+    height = np.minimum(np.nan_to_num(height, posinf=1e3), 1e3)
+    raised = readings_above_table(frame, grid) & (height > TABLE_TOLERANCE) & ~beyond_table(frame)
+    raised &= ~_doubtful(frame, raised, height, seen) & ~(_beside_beyond(frame) & (height < _SMEARED))
     solid = raised | (~frame.valid & (height > TABLE_TOLERANCE))
     core = cv2.morphologyEx(solid.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     regions, _ = ndimage.label(core)
@@ -185,9 +171,25 @@ def _regions_of_readings(frame: Frame, grid: VoxelGrid | None, seen: _Colours) -
         for values in (np.ones(core.shape), height, seen.distance > _SAME_COLOUR)
     )
     kept = (area >= scaled_area(_SMALLEST, raised.size)) & (rise > _RISE * TABLE_TOLERANCE * area)
-    kept &= (other > _OTHER_COLOUR * area) | (rise >= _LOW * area) | (area >= scaled_area(_SMALL, raised.size))
+    kept &= (other > _OTHER_COLOUR * area) | (rise >= _LOW * area)
     kept[0] = False
     return (cv2.dilate(kept[regions].astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & raised
+
+
+def _doubtful(frame: Frame, raised: np.ndarray, height: np.ndarray, seen: _Colours) -> np.ndarray:
+    """Pixels (H, W) bool of low `raised` readings that have the colour of the table and not that of an object.
+
+    Around objects, sensors smear the depth into the table; glare, cloth, and the end of a table rise too. The colours
+    of the nearby higher readings decide. Without any nearby, a low reading with the colour of the table is doubtful.
+    A low region that higher readings enclose is the inside of a plate.
+    """
+    low = raised & (height < _SMEARED)
+    high = (raised & ~low).astype(np.uint8)
+    share, log_ratio = seen.like_object(cv2.erode(high, _ellipse(scaled_length(_CORE, frame.camera.width))) > 0)
+    beside = (seen.distance < _SHADED) & (-log_ratio > _DOUBT * height)
+    alone = (seen.distance < _LIKE_TABLE) & (height < _LOW)
+    found = _opened(low & np.where(share > _FEW_NEAR, beside, alone), 1)
+    return found & ~_enclosed(found, raised & ~found, frame.valid, _PLATE)
 
 
 def _on_table(frame: Frame) -> np.ndarray:
@@ -197,9 +199,17 @@ def _on_table(frame: Frame) -> np.ndarray:
 
 
 def _without_readings(frame: Frame) -> np.ndarray:
-    """Pixels (H, W) bool that have no reading, do not show the robot, and are not in the shadow of the projector."""
-    missing = ~np.isfinite(frame.depth) & ~_shadows(frame)
+    """Pixels (H, W) bool without reading that can show an object.
+
+    They do not show the robot, are not in the shadow of the projector, and not beside what is beyond the table.
+    """
+    missing = ~np.isfinite(frame.depth) & ~_shadows(frame) & ~_beside_beyond(frame)
     return missing if frame.robot_mask is None else missing & ~frame.robot_mask
+
+
+def _beside_beyond(frame: Frame) -> np.ndarray:
+    """Pixels (H, W) bool beside walls and what else is beyond the table, where depth is smeared or missing."""
+    return cv2.dilate(beyond_table(frame).astype(np.uint8), _ellipse(2 * _reach(frame.camera.width))) > 0
 
 
 def _shadows(frame: Frame) -> np.ndarray:
@@ -254,9 +264,7 @@ def _outlined(frame: Frame, pixels: np.ndarray, seen: _Colours) -> np.ndarray:
     core = cv2.erode(image, _ellipse(scaled_length(_CORE, width))) > 0
     regions, _ = ndimage.label(pixels)
     core |= pixels & ~np.isin(regions, regions[core])  # a thin object is its own core
-    share, mean, variance = _around(seen.lab, core, _CORE_REACH)
-    distance = ((seen.lab - mean) ** 2 / variance).sum(axis=-1)
-    log_ratio = 0.5 * (seen.distance + seen.log_variance - distance - np.log(variance).sum(axis=-1))
+    share, log_ratio = seen.like_object(core)
     log_prior = np.where(frame.valid, np.where(pixels, _REMOVED, -_ADDED), 0)
     return np.asarray(np.where(asked & (share > _FEW_NEAR), log_ratio + log_prior > 0, pixels))
 
@@ -289,10 +297,10 @@ def _around(image: np.ndarray, pixels: np.ndarray, reach: float) -> tuple[np.nda
 
     The surroundings have a standard deviation of `reach` pixels of an image of 640 x 480 pixels.
     """
-    share = _surroundings(pixels.astype(np.float32), reach)
+    share = surroundings(pixels.astype(np.float32), reach)
     n = np.maximum(share, 1e-6)[..., None]
-    mean = _surroundings(image * pixels[..., None], reach) / n
-    variance = np.maximum(_surroundings(image**2 * pixels[..., None], reach) / n - mean**2, 0) + _COLOUR_NOISE
+    mean = surroundings(image * pixels[..., None], reach) / n
+    variance = np.maximum(surroundings(image**2 * pixels[..., None], reach) / n - mean**2, 0) + _COLOUR_NOISE
     return share, mean, variance
 
 
@@ -320,15 +328,6 @@ def _measured_part(frame: Frame) -> np.ndarray:
     if points is not None:
         cv2.fillConvexPoly(part, cv2.convexHull(points), 1)
     return part > 0
-
-
-def _surroundings(image: np.ndarray, reach: float) -> np.ndarray:
-    """Mean of an image (H, W, ...) around each pixel, computed at a lower resolution."""
-    size, step = (image.shape[1], image.shape[0]), 4 if reach > _FINE else 2
-    small = cv2.resize(image, (max(1, size[0] // step), max(1, size[1] // step)), interpolation=cv2.INTER_AREA)
-    spread = max(1.0, scaled_length(reach, size[0]) / step)
-    small = cv2.GaussianBlur(small, (0, 0), spread, borderType=cv2.BORDER_CONSTANT)
-    return cv2.resize(small, size, interpolation=cv2.INTER_LINEAR)
 
 
 def _joined(measured: np.ndarray, silent: np.ndarray, table: np.ndarray, missing: np.ndarray) -> np.ndarray:

@@ -45,3 +45,11 @@ from mstfilter.scoring.questions import (
     draw_questions as draw_questions,
     in_question as in_question,
 )
+from mstfilter.scoring.statistics import (
+    Difference as Difference,
+    Differences as Differences,
+    compare_arms as compare_arms,
+    compare_runs as compare_runs,
+    conclusion as conclusion,
+    plot_differences as plot_differences,
+)

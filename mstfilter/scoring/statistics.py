@@ -4,8 +4,13 @@
 >>> round(difference.mean, 3), difference.n, round(difference.p, 2)
 (0.167, 3, 0.25)
 >>> table = {"ours": [0.9, 0.8, 0.8], "theirs": [0.7, 0.7, 0.6], "floor": [0.1, 0.2, 0.1]}
->>> [(arm, round(d.p_holm, 2)) for arm, d in compare_arms(table, reference="ours").items()]
+>>> found = compare_arms(table, reference="ours")
+>>> [(arm, round(d.p_holm, 2)) for arm, d in found.items()]
 [('theirs', 0.5), ('floor', 0.5)]
+>>> print(str(found).splitlines()[0][:61])                   # the conclusions in words; found.plot() draws them
+theirs and ours: no difference can be claimed at n = 3 (-0.16
+
+`compare_runs`, which is also ``runs.compare(...)``, compares the errors of filters over the seeds of `run_many`.
 
 Values are paired by unit: a scene, a data set, or a seed that all arms share. Units must be independent, so values of
 several filter seeds on one scene are averaged first.
@@ -23,11 +28,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mstfilter.base.errors import InputError
+from mstfilter.base.lazy import late
+
+if TYPE_CHECKING:
+    from mstfilter.smc import History
 
 LEVEL = 0.95  # of intervals
 SIGNIFICANT = 0.05  # a claim needs a smaller adjusted p value
@@ -150,7 +159,23 @@ def holm(p: Sequence[float]) -> np.ndarray:
     return out
 
 
-def compare_arms(table: Mapping[str, Values], reference: str) -> dict[str, Difference]:
+class Differences(dict[str, Difference]):
+    """Differences of several methods from a reference, by name. ``print`` shows the conclusions in words."""
+
+    def __init__(self, found: Mapping[str, Difference], reference: str, unit: str = "unit", label: str = "") -> None:
+        super().__init__(found)
+        self.reference, self.unit, self.label = reference, unit, label
+
+    def __str__(self) -> str:
+        return "\n".join(conclusion(d, arm, self.reference, self.label, self.unit) for arm, d in self.items())
+
+    plot = late("mstfilter.app.report.charts:draw_differences", "Differences with their intervals.")
+
+
+plot_differences = late("mstfilter.app.report.charts:draw_differences", "Differences with their intervals.")
+
+
+def compare_arms(table: Mapping[str, Values], reference: str, unit: str = "unit") -> Differences:
     """Differences of every compared method from the reference, with p values adjusted for all comparisons.
 
     Parameters
@@ -159,17 +184,53 @@ def compare_arms(table: Mapping[str, Values], reference: str) -> dict[str, Diffe
         Name of a compared method -> values, as for `compare`.
     reference : str
         The method with which the other methods are compared.
+    unit : str
+        The word for a paired unit, for the conclusions.
 
     Returns
     -------
-    dict
+    Differences
         Mapping from names of methods, without the reference, to `Difference`.
     """
     if reference not in table:
         raise InputError(f"there is no arm {reference!r}", f"there are: {', '.join(table) or 'no arms'}")
     found = {arm: compare(values, table[reference]) for arm, values in table.items() if arm != reference}
     p = holm([d.p for d in found.values()])
-    return {arm: replace(d, p_holm=float(q)) for (arm, d), q in zip(found.items(), p, strict=True)}
+    adjusted = {arm: replace(d, p_holm=float(q)) for (arm, d), q in zip(found.items(), p, strict=True)}
+    return Differences(adjusted, reference, unit)
+
+
+def compare_runs(runs: History, reference: str, **truth: Any) -> Differences:
+    """Differences between the squared errors of filters, paired by seed.
+
+    >>> runs = run_many({"few": ..., "many": ...}, ys, seeds=range(100), mean=mean)     # doctest: +SKIP
+    >>> print(runs.compare("few", mean=exact.means))                                     # doctest: +SKIP
+
+    Parameters
+    ----------
+    runs : History
+        Of `run_many` with several filters.
+    reference : str
+        The filter with which the others are compared.
+    **truth : (T, ...) array_like
+        The exact values of one collected quantity, by its name. The error of a run is the mean of its squared
+        deviations over time and entries; one that is lost has no error, and is left out of its pairs.
+
+    Seeds are independent given the observations, so a conclusion holds for these observations only.
+    """
+    if runs.dims != ("arm", "seed", "time") or len(truth) != 1:
+        raise InputError(
+            f"compare got a history with the axes {', '.join(runs.dims)} and {len(truth)} exact quantities",
+            'it takes the runs of several filters and one quantity: runs.compare("systematic", mean=exact)',
+        )
+    ((name, given),) = truth.items()
+    values, exact = runs[name], np.asarray(given, np.float64)
+    if values.shape[2:] != exact.shape:
+        raise InputError(f"exact values of {name!r} have shape {exact.shape}, expected {values.shape[2:]}")
+    errors = np.square(values - exact).mean(axis=tuple(range(2, values.ndim)))
+    found = compare_arms(dict(zip(runs.coords["arm"], errors, strict=True)), reference, "seed")
+    found.label = f"the squared error of {name}"
+    return found
 
 
 def slope(times: np.ndarray, values: np.ndarray) -> float:

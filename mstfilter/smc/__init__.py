@@ -5,10 +5,11 @@ what is known about x_t by weighted particles:
 
 >>> from mstfilter.smc import EssBelow, Normal, ParticleFilter, Reweight, StateSpaceModel, Systematic, bootstrap
 >>> model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 1.0))
->>> state, infos = bootstrap(model, n=1000).run([0.3, -0.1, 0.8], seed=0)       # a textbook filter
+>>> states, observations = model.simulate(50, seed=1)                          # data to try it on
+>>> state, infos = bootstrap(model, n=1000).run(observations, seed=0)          # a textbook filter
 >>> state.population.particles.shape, state.population.weights.shape
 ((1000,), (1000,))
->>> log_evidence = state.log_evidence                                          # of log p(y_0, y_1, y_2)
+>>> mean, log_evidence = state.population.mean(), state.log_evidence           # of x_t, and of log p(y_0 .. y_t)
 
 The filter is made of components, and each can be replaced by one of your own:
 
@@ -28,7 +29,8 @@ Read first `filter` (the loop), `interfaces` (what a component promises) and `po
 `components`            update by a likelihood, branching, triggers, sizes, equality of particles
 `inputs`                time and inputs of models: `WithInput`, an observation with an input
 `streams`               random streams named by seed, step, slot and index
-`history`               collectors: quantities of a run, recorded at every step
+`summaries`             moments, quantiles and circular means of weighted particles
+`history`               collectors: quantities of a run, recorded at every step; charts and tables of them
 `running`, `sweep`      `run_many`: several filters, seeds and data sets; many runs at once, as arrays
 `first_steps`           examines the functions of a model at the first steps of a run
 `checkpoint`            storage of the state of a run in a file

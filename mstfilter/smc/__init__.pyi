@@ -20,12 +20,18 @@ from mstfilter.smc.diverse_resampling import (
 from mstfilter.smc.filter import ParticleFilter as ParticleFilter
 from mstfilter.smc.history import (
     History as History,
+    circular_mean as circular_mean,
     collect as collect,
+    covariance as covariance,
     ess as ess,
     log_evidence as log_evidence,
     mean as mean,
+    particles as particles,
+    quantiles as quantiles,
     resampled as resampled,
     unique_ancestors as unique_ancestors,
+    variance as variance,
+    weights as weights,
 )
 from mstfilter.smc.inference.additive import additive as additive
 from mstfilter.smc.inference.conditional import conditional_path as conditional_path, path_log_prob as path_log_prob
@@ -72,6 +78,7 @@ from mstfilter.smc.interfaces import (
     Update as Update,
     WeightResampler as WeightResampler,
 )
+from mstfilter.smc.models.combined import Mixture as Mixture, Product as Product, Truncated as Truncated
 from mstfilter.smc.models.distributions import (
     Bernoulli as Bernoulli,
     Categorical as Categorical,
@@ -89,6 +96,15 @@ from mstfilter.smc.models.exact import (
     hidden_markov as hidden_markov,
     kalman_filter as kalman_filter,
     linear_gaussian as linear_gaussian,
+)
+from mstfilter.smc.models.families import (
+    Beta as Beta,
+    Binomial as Binomial,
+    Dirichlet as Dirichlet,
+    Gamma as Gamma,
+    LogNormal as LogNormal,
+    Poisson as Poisson,
+    VonMises as VonMises,
 )
 from mstfilter.smc.models.gaussian import (
     ConditionallyLinear as ConditionallyLinear,

@@ -19,9 +19,10 @@ x_{t-1}, 0.5^2) and y_t ~ N(x_t, 1) moves by the model and weights by the likeli
 >>> from mstfilter.smc import Dynamics, Normal, ParticleFilter, Prior, Reweight, StateSpaceModel
 >>> model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 1.0))
 >>> filter = ParticleFilter(Prior(model), Dynamics(model), update=Reweight(model.log_likelihood), n=1000)
->>> state, infos = filter.run([0.3, -0.1, 0.8], seed=0)
->>> mean = state.population.weights @ state.population.particles           # E[x_2 | y_0 .. y_2]
->>> log_evidence = state.log_evidence                                      # an estimate of log p(y_0 .. y_2)
+>>> states, observations = model.simulate(50, seed=1)
+>>> state, infos = filter.run(observations, seed=0)
+>>> mean = state.population.mean()                                         # E[x_49 | y_0 .. y_49]
+>>> log_evidence = state.log_evidence                                      # an estimate of log p(y_0 .. y_49)
 
 `bootstrap(model, n=1000)` is the same filter. Guided filters have a transition that also weights particles, and MST
 (Price, Huang, Berenson 2021) uses all four components above. With ``resample="before"``, a step also resamples after

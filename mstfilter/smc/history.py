@@ -4,15 +4,18 @@ A run returns its last state, because all populations of a long run would not fi
 others is computed as they come: a collector is a function ``(state, info) -> number or array`` that is called after
 every step.
 
->>> from mstfilter.smc import Normal, StateSpaceModel, bootstrap, collect, ess, mean
+>>> from mstfilter.smc import Normal, StateSpaceModel, bootstrap, collect, ess, quantiles
 >>> model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 1.0))
->>> steps = bootstrap(model, n=100).iterate([0.3, -0.1, 0.8], 0)
->>> history = collect(steps, ess=ess, mean=mean, largest=lambda state, info: state.population.weights.max())
->>> history["mean"].shape, sorted(history)
-((3,), ['ess', 'largest', 'mean'])
+>>> states, ys = model.simulate(50, seed=1)
+>>> steps = bootstrap(model, n=100).iterate(ys)
+>>> history = collect(steps, ess=ess, x=quantiles(), largest=lambda state, info: state.population.weights.max())
+>>> history["x"].shape, sorted(history)
+((50, 3), ['ess', 'largest', 'x'])
+>>> figure = history.plot(band=0.9, x=states)                    # the band of x and the true states
 
-`mstfilter.smc.run_many` takes the same collectors, and ``history.to_xarray()`` makes a labelled data set of the
-arrays.
+`mstfilter.smc.run_many` takes the same collectors; then ``runs.plot()`` shows the spread over seeds, and
+``runs.compare(...)`` says which filter has the smaller errors. ``history.to_pandas()`` makes a table, and
+``history.to_xarray()`` a labelled data set.
 """
 
 from __future__ import annotations
@@ -24,8 +27,11 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.base.errors import InputError, missing_library
+from mstfilter.base.errors import InputError
+from mstfilter.base.lazy import late
 from mstfilter.smc.interfaces import Info, State
+from mstfilter.smc.population import Population
+from mstfilter.smc.summaries import check_levels, data_frame, drawn_by_weight, flat_columns, imported, inference_data
 
 Collector = Callable[[State, Info], Any]
 
@@ -53,15 +59,57 @@ def resampled(state: State, info: Info) -> bool:
 
 
 def mean(state: State, info: Info) -> Any:
-    """Weighted mean of array particles."""
+    """Weighted mean of the particles (see `Population.mean`)."""
+    return _population(state).mean()
+
+
+def variance(state: State, info: Info) -> Any:
+    """Weighted variances of the entries of the particles."""
+    return _population(state).variance()
+
+
+def covariance(state: State, info: Info) -> np.ndarray:
+    """Weighted covariance (d, d) of the d entries of a particle."""
+    return _population(state).covariance()
+
+
+def circular_mean(state: State, info: Info) -> Any:
+    """Weighted mean of particles that are angles in radians."""
+    return _population(state).circular_mean()
+
+
+def particles(state: State, info: Info) -> Any:
+    """All particles, which needs much memory; for `History.to_arviz`."""
+    return _population(state).particles
+
+
+def weights(state: State, info: Info) -> np.ndarray:
+    """(n,) weights of the particles, which sum to one."""
+    return _population(state).weights
+
+
+@dataclass(frozen=True)
+class Quantiles:
+    """The collector that `quantiles` makes."""
+
+    levels: tuple[float, ...]
+    function: Callable[[Any], Any] | None = None
+
+    def __call__(self, state: State, info: Info) -> Any:
+        return _population(state).quantiles(self.levels, self.function)
+
+
+def quantiles(*levels: float, function: Callable[[Any], Any] | None = None) -> Quantiles:
+    """A collector of weighted quantiles (levels, ...) of the particles, or of ``function(particles)``.
+
+    The default levels are .05, .5 and .95: a band of 90 % and the median.
+    """
+    return Quantiles(check_levels(levels or (0.05, 0.5, 0.95)), function)
+
+
+def _population(state: State) -> Population:
     assert state.population is not None
-    particles = state.population.particles
-    if not isinstance(particles, np.ndarray):
-        raise InputError(
-            f"the mean of particles of type {type(particles).__name__} is not defined",
-            "write a collector: lambda state, info: state.population.weights @ state.population.particles['x']",
-        )
-    return np.tensordot(state.population.weights, particles, axes=1)
+    return state.population
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +122,8 @@ class History(Mapping[str, np.ndarray]):
     state: State | None = None  #: the last state of a single run
     #: Seed or (arm, seed) -> why the run ended early: all weights became zero.
     lost: Mapping[Any, str] = field(default_factory=dict)
+    #: Name -> levels of collected quantiles, along the first axis after `dims`.
+    levels: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self.values_:
@@ -102,27 +152,52 @@ class History(Mapping[str, np.ndarray]):
         named = dict(zip(self.dims, labels, strict=True))
         return flat_columns({**named, **self.values_}, axes=len(self._shape))
 
+    def to_pandas(self) -> Any:
+        """A ``pandas.DataFrame`` of `columns`; MissingLibraryError if pandas is not installed."""
+        return data_frame(self.columns())
+
     def to_xarray(self) -> Any:
         """An ``xarray.Dataset`` with named dimensions; MissingLibraryError if xarray is not installed."""
-        try:
-            import xarray
-        except ImportError as error:
-            raise missing_library(error, "this export", library="xarray") from error
-        data = {
-            name: ((*self.dims, *(f"{name}_{k}" for k in range(a.ndim - len(self.dims)))), a)
+        xarray, data, coords = imported("xarray"), {}, dict(self.coords)
+        for name, a in self.values_.items():
+            axes = [f"{name}_{k}" for k in range(a.ndim - len(self.dims))]
+            if name in self.levels:
+                axes[0] = f"{name}_level"
+                coords[axes[0]] = list(self.levels[name])
+            data[name] = ((*self.dims, *axes), a)
+        return xarray.Dataset(data, coords=coords)
+
+    def to_arviz(self, weights: str = "weights", resample: bool = True) -> Any:
+        """The particles of all steps of one run as draws for ArviZ, with the dimension "time" after chain and draw.
+
+        `weights` names the collected `weights`. What was collected for as many particles is exported. At each time,
+        draws are particles selected by weight, because ArviZ's statistics do not use weights; so the draws at two
+        times are no path. With ``resample=False`` they are the particles as they are. ``sample_stats`` holds the
+        weight that each draw has.
+
+        >>> history = collect(filter.iterate(observations), x=particles, weights=weights)    # doctest: +SKIP
+        >>> arviz.plot_forest(history.to_arviz())                                             # doctest: +SKIP
+        """
+        if weights not in self.values_ or self.dims != ("time",):
+            raise InputError(
+                f"this history has no {weights!r} of one run",
+                "collect(filter.iterate(observations), x=particles, weights=weights)",
+            )
+        w = self.values_[weights]
+        step = np.arange(len(w))[:, None]
+        rows = np.stack([drawn_by_weight(row) if resample else np.arange(len(row)) for row in w])
+        posterior = {
+            name: np.moveaxis(a[step, rows], 0, 1)[None]
             for name, a in self.values_.items()
+            if name != weights and a.shape[:2] == w.shape and name not in self.levels
         }
-        return xarray.Dataset(data, coords=dict(self.coords))
+        kept = np.full(w.shape, 1 / w.shape[1]) if resample else w
+        dims = {name: ["time", *(f"{name}_{k}" for k in range(a.ndim - 3))] for name, a in posterior.items()}
+        axes = {"dims": {**dims, "weight": ["time"]}, "coords": {"time": self.coords["time"]}}
+        return inference_data(posterior, {"weight": kept.T[None]}, **axes)
 
-
-def flat_columns(arrays: Mapping[str, Any], axes: int = 1) -> dict[str, np.ndarray]:
-    """Table columns from arrays. The first `axes` axes index the rows; array x has columns ``x_0``, ``x_1``, ..."""
-    columns = {}
-    for name, a in arrays.items():
-        a = np.asarray(a)
-        for k in np.ndindex(a.shape[axes:]):
-            columns["_".join([name, *map(str, k)])] = a[(..., *k)].reshape(-1)
-    return columns
+    plot = late("mstfilter.app.report.charts:plot_history", "Collected quantities over time, with bands.")
+    compare = late("mstfilter.scoring.statistics:compare_runs", "Which filter has the smaller errors.")
 
 
 def _summary(name: str, a: np.ndarray) -> str:
@@ -142,9 +217,25 @@ def collect(steps: Iterable[tuple[State, Info]], /, **collectors: Collector) -> 
     for state, info in steps:
         times.append(info.t)
         for name, collector in collectors.items():
-            rows[name].append(np.asarray(collector(state, info)))
-    values = {name: stacked(name, row) for name, row in rows.items()}
-    return History(values, ("time",), {"time": np.array(times, dtype=np.int64)}, state)
+            rows[name].append(collector(state, info))
+    values = {key: stacked(key, row) for name in rows for key, row in by_key(name, rows[name]).items()}
+    time = {"time": np.array(times, dtype=np.int64)}
+    return History(values, ("time",), time, state, levels=levels_of(collectors, values))
+
+
+def by_key(name: str, rows: list[Any]) -> dict[str, list[np.ndarray]]:
+    """Results of a collector as arrays. Those that are mappings, as of a program, give arrays ``name_variable``."""
+    if rows and isinstance(rows[0], Mapping):
+        return {f"{name}_{key}": [np.asarray(row[key]) for row in rows] for key in rows[0]}
+    return {name: [np.asarray(row) for row in rows]}
+
+
+def levels_of(collectors: Mapping[str, Collector], names: Iterable[str]) -> dict[str, tuple[float, ...]]:
+    """Levels of the collected quantiles by the name of the array."""
+    made = {name: collector.levels for name, collector in collectors.items() if isinstance(collector, Quantiles)}
+    return {
+        key: levels for key in names for name, levels in made.items() if key == name or key.startswith(f"{name}_")
+    }
 
 
 def check_collectors(collectors: Mapping[str, Any]) -> None:

@@ -9,7 +9,7 @@ observations underflow:
 >>> population = Population(np.array([0.0, 1.0, 2.0]), np.log([1.0, 1.0, 2.0]))
 >>> population.weights
 array([0.25, 0.25, 0.5 ])
->>> float(population.weights @ population.particles)                # the expectation of x
+>>> float(population.mean())                                        # the expectation of x
 1.25
 
 If few particles carry most of the weight, the others are wasted. The effective sample size (sum w)^2 / sum w^2 says
@@ -37,10 +37,24 @@ import numpy as np
 from mstfilter.base.errors import InputError, LostRunError
 from mstfilter.base.lazy import late
 from mstfilter.base.processes import each
+from mstfilter.smc.summaries import (
+    by_variable,
+    check_levels,
+    data_frame,
+    drawn_by_weight,
+    flat_columns,
+    inference_data,
+    weighted_circular_mean,
+    weighted_covariance,
+    weighted_mean,
+    weighted_quantiles,
+    weighted_variance,
+)
 
 _T = TypeVar("_T")
 _U = TypeVar("_U")
 
+Function = Callable[[Any], Any]  # of the particles: an array (n, ...), or a mapping of such
 Particles = Any  # ndarray (n, ...) | mapping name -> ndarray (n, ...) | sequence of objects
 
 
@@ -310,6 +324,58 @@ class Population:
             object.__setattr__(self, "_both", both)
         return self.__dict__["_both"]
 
+    def mean(self, function: Function | None = None) -> Any:
+        """Weighted mean (...) of particles (n, ...), or a mapping of means for a mapping of arrays.
+
+        ``function(particles)`` (n, ...) may say what is averaged, as in all summaries (`mstfilter.smc.summaries`).
+        """
+        return by_variable(weighted_mean, self._values(function), self.weights)
+
+    def variance(self, function: Function | None = None) -> Any:
+        """Weighted variances (...) of the entries of particles (n, ...)."""
+        return by_variable(weighted_variance, self._values(function), self.weights)
+
+    def covariance(self, function: Function | None = None) -> np.ndarray:
+        """Weighted covariance (d, d) of the d entries of a particle, in the order of `columns`."""
+        columns = _columns(self._values(function))
+        return by_variable(weighted_covariance, np.stack([*columns.values()], axis=1), self.weights)
+
+    def quantiles(self, levels: Any = (0.05, 0.5, 0.95), function: Function | None = None) -> Any:
+        """Weighted quantiles (levels, ...) of the entries of particles (n, ...), of one level or several."""
+        return by_variable(weighted_quantiles, self._values(function), self.weights, check_levels(levels))
+
+    def circular_mean(self, function: Function | None = None, period: float = 2 * math.pi) -> Any:
+        """Weighted mean (...) of angles (n, ...), from -period / 2 to period / 2. Degrees have the period 360."""
+        return by_variable(weighted_circular_mean, self._values(function), self.weights, period)
+
+    def _values(self, function: Function | None) -> Any:
+        """What is summarised: the particles, or a function of them."""
+        if function is None:
+            return self.particles
+        values = function(self.particles)
+        return values if isinstance(values, Mapping) else np.asarray(values)
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """Columns of a table with a row per particle: its entries ``x``, or ``x_0`` ..., and its weight."""
+        return {**_columns(self.particles), "weight": self.weights}
+
+    def to_pandas(self) -> Any:
+        """A ``pandas.DataFrame`` with one row per particle and the column "weight"."""
+        return data_frame(self.columns())
+
+    def to_arviz(self, resample: bool = True) -> Any:
+        """The particles as draws of one chain for ArviZ, whose statistics do not use weights.
+
+        So the draws are particles selected by weight. With ``resample=False`` they are all particles, as they are.
+        The group ``sample_stats`` holds the weight that each draw has.
+        """
+        weights = self.weights
+        rows = drawn_by_weight(weights) if resample else np.arange(len(self))
+        values: Any = take(self.particles, rows)
+        named = values if isinstance(values, Mapping) else {"x": values}
+        kept = np.full(len(self), 1 / len(self)) if resample else weights
+        return inference_data({name: np.asarray(a)[None] for name, a in named.items()}, {"weight": kept[None]})
+
     @property
     def unique_ancestors(self) -> int:
         """Number of particles of the previous population that have descendants; 0 if the parents are unknown."""
@@ -339,7 +405,7 @@ class Population:
             raise InputError(
                 f"{len(heaviest)} of {len(self)} particles share the largest weight, so none of them is the best",
                 "of scenes, mstfilter.Belief(population).estimate() is the best single answer",
-                "of numbers, use the weighted mean: np.average(particles, axis=0, weights=population.weights)",
+                "of numbers, use the weighted mean: population.mean()",
             )
         if isinstance(tied, Mapping):
             return {name: a[0] for name, a in tied.items()}
@@ -444,6 +510,12 @@ def digest_of(population: Population) -> str:
         if isinstance(a, np.ndarray) and a.dtype != object:
             found.update(f"{name} {a.dtype.str} {a.shape}".encode() + np.ascontiguousarray(a).tobytes())
     return found.hexdigest()
+
+
+def _columns(values: Any) -> dict[str, np.ndarray]:
+    """The entries (n,) of arrays by name. Raises InputError for objects."""
+    by_variable(np.shape, values)
+    return flat_columns(values if isinstance(values, Mapping) else {"x": values})
 
 
 def _kind(particles: Particles) -> str:

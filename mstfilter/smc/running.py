@@ -34,7 +34,15 @@ from mstfilter.base.lazy import progress_of
 from mstfilter.base.processes import environment
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.first_steps import unexamined
-from mstfilter.smc.history import Collector, History, check_collectors, check_one_shape, collect, log_evidence
+from mstfilter.smc.history import (
+    Collector,
+    History,
+    check_collectors,
+    check_one_shape,
+    collect,
+    levels_of,
+    log_evidence,
+)
 from mstfilter.smc.inputs import check_observations
 from mstfilter.smc.interfaces import Info, State
 from mstfilter.smc.streams import Key
@@ -196,18 +204,21 @@ class _Job:
         runs = [found[task] for task in product(self.arms, self.seeds)]
         dims = tuple(sizes) if has_arms else ("seed", "time")
         values = {}
-        for name in self.collectors:
-            rows = self.joined(name, [run.rows[name] for run in runs], sizes["time"])
+        # A run that is lost at its first step does not know the variables of a collector that returns mappings.
+        known = max((run.rows for run in runs), key=lambda rows: max(map(len, rows.values()), default=0))
+        for name, some in known.items():
+            rows = self.joined(name, [run.rows.get(name, some[:0]) for run in runs], sizes["time"])
             values[name] = rows.reshape(*(sizes[dim] for dim in dims), *rows.shape[2:])
         lost = {task if has_arms else task[1]: found[task].lost for task in found if found[task].lost}
-        return History(values, dims, {dim: coords[dim] for dim in dims}, lost=lost)
+        levels = levels_of(self.collectors, values)
+        return History(values, dims, {dim: coords[dim] for dim in dims}, lost=lost, levels=levels)
 
     def joined(self, name: str, rows: list[np.ndarray], n_steps: int) -> np.ndarray:
         """Values (run, time, ...) of a collector; -inf or NaN after all weights of a run became zero."""
         longest = max(rows, key=len)
         check_one_shape(name, [row.shape[1:] for row in rows if len(row)])
         complete = all(len(row) == n_steps for row in rows)
-        empty = -np.inf if self.collectors[name] is log_evidence else np.nan
+        empty = -np.inf if self.collectors.get(name) is log_evidence else np.nan
         kinds = {row.dtype for row in rows if len(row)} or {longest.dtype}
         kind = np.result_type(*kinds, *([] if complete else [np.float64]))
         values = np.full((len(rows), n_steps, *longest.shape[1:]), 0 if complete else empty, kind)

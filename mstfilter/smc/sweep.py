@@ -25,7 +25,7 @@ import numpy as np
 from mstfilter.base.errors import LostRunError, naming
 from mstfilter.smc.components import Always, EssBelow, Never
 from mstfilter.smc.filter import ParticleFilter, keep_freed_memory
-from mstfilter.smc.history import Collector, check_one_shape, ess, log_evidence, resampled, stacked
+from mstfilter.smc.history import Collector, by_key, check_one_shape, ess, log_evidence, resampled, stacked
 from mstfilter.smc.inputs import split_input
 from mstfilter.smc.interfaces import Info, State
 from mstfilter.smc.population import Population, identity, take
@@ -93,7 +93,7 @@ class _Sweep:
         for t, observation in enumerate(observations):
             if len(self.runs):
                 self.step(t, *split_input(observation))
-        tables = {name: self.table(name) for name in self.collectors}
+        tables = {name: self.table(name) for name in (self.found[0][1] if self.found else self.collectors)}
         ends = np.zeros(self.n_runs, int)
         for runs, _ in self.found:
             ends[runs] += 1
@@ -232,12 +232,13 @@ class _Sweep:
         log_mean = self.log_mean if proper else np.full(len(self.runs), np.nan)
         found = {log_evidence: log_mean, ess: self.ess, resampled: moved}
         steps = [self.seen(t, row, moved, ancestors) for row in range(len(self.runs))] if self.traced else []
-        values = {
-            name: found[collector]
-            if collector in found
-            else stacked(name, [self.collected(collector, row, step) for row, step in enumerate(steps)])
-            for name, collector in self.collectors.items()
-        }
+        values: dict[str, np.ndarray] = {}
+        for name, collector in self.collectors.items():
+            if collector in found:
+                values[name] = found[collector]
+                continue
+            rows = by_key(name, [self.collected(collector, row, step) for row, step in enumerate(steps)])
+            values |= {key: stacked(key, row) for key, row in rows.items()}
         self.found.append((self.runs, values))
 
     def seen(self, t: int, row: int, moved: np.ndarray, ancestors: np.ndarray) -> tuple[State, Info]:
@@ -254,10 +255,10 @@ class _Sweep:
         info = Info(t, n, n, float(self.ess[row]), bool(moved[row]))
         return State(t + 1, population, key, self.filter.properly_weighted), info
 
-    def collected(self, collector: Collector, row: int, step: tuple[State, Info]) -> np.ndarray:
+    def collected(self, collector: Collector, row: int, step: tuple[State, Info]) -> Any:
         """The value of a collector for one run."""
         with naming(f"seed {self.seeds[self.runs[row]]}"):
-            return np.asarray(collector(*step))
+            return collector(*step)
 
 
 def summaries(log_weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -86,7 +86,7 @@ def test_a_stopped_conversion_leaves_no_folder(tmp_path, capsys, monkeypatch, st
 def test_run_reads_a_bag_as_its_conversion(tmp_path, capsys):
     """The same hypotheses whether the data were converted before or not."""
     path = write_bag(tmp_path / "data", "mcap", scene_messages(False))
-    options = ["--no-report", "n=3"]
+    options = ["--no-report", "n=3", "n_proposed=2"]
     code, out, err = call("run", path, "--out", tmp_path / "direct", *options, capsys=capsys)
     assert code == 0, err
     assert "pause 1     3 hypotheses" in out
@@ -101,7 +101,9 @@ def test_run_reads_a_bag_as_its_conversion(tmp_path, capsys):
 
 def test_quality(tmp_path, capsys):
     recording = write(tmp_path / "slide")
-    code, _, err = call("run", recording, "n=3", "--out", tmp_path / "run", "--no-report", capsys=capsys)
+    code, _, err = call(
+        "run", recording, "n=3", "n_proposed=2", "--out", tmp_path / "run", "--no-report", capsys=capsys
+    )
     assert code == 0, err
     code, out, err = call("quality", tmp_path / "run", recording, "--csv", tmp_path / "q.csv", capsys=capsys)
     assert code == 0, err

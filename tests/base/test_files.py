@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from mstfilter.base.errors import InputError, InputWarning
-from mstfilter.base.files import atomic_folder, atomic_path, damaged_files, locked, sweep, write_sums
+from mstfilter.base.files import atomic_folder, atomic_path, cache_folder, damaged_files, locked, sweep, write_sums
 from mstfilter.formats import RecordingWriter, open_recording, save_recording
 from mstfilter.lab.simulation import cached_recording
 from mstfilter.runs import filter_recording
@@ -239,3 +239,11 @@ def test_sums_are_those_of_sha256sum(tmp_path):
     for broken in ("", text[1:], text + "\x1b[2J", text.replace("  ", " ")):
         (tmp_path / "SHA256SUMS").write_text(broken)
         assert damaged_files(tmp_path) == ["SHA256SUMS has changed"]
+
+
+def test_the_cache_is_where_the_environment_says(monkeypatch, tmp_path):
+    monkeypatch.setenv("MSTFILTER_CACHE", str(tmp_path / "a"))
+    assert cache_folder() == tmp_path / "a"
+    monkeypatch.delenv("MSTFILTER_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "b"))
+    assert cache_folder() == tmp_path / "b" / "mstfilter"

@@ -39,6 +39,7 @@ def test_output_weights_by_enumeration(k, monkeypatch):
     np.testing.assert_allclose(found, np.exp(population.log_weights + 700) / 5, rtol=1e-9)
 
 
+@pytest.mark.nightly
 def test_sets_by_enumeration():
     """Chi-square of all 35 sets of three; false alarm 1e-6."""
     population, rng = example(7), np.random.default_rng(1)

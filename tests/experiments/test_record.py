@@ -45,6 +45,16 @@ def test_figures_of_the_front_page_name_the_version_of_their_study():
             assert f"commit {STUDIES[name].record()['commit']}" in " ".join(item.split()), item
 
 
+FINGERPRINT = """
+import json, sys
+from pathlib import Path
+from mstfilter.a import x
+out = Path(sys.argv[1])
+out.write_text(json.dumps(x))
+sys.exit("--against" in sys.argv and out.read_text() != Path(sys.argv[3]).read_text())
+"""
+
+
 @pytest.fixture
 def study(tmp_path, monkeypatch):
     """A repository with one study, whose command counts its runs."""
@@ -56,6 +66,7 @@ def study(tmp_path, monkeypatch):
         "models/mst.toml": "n = 5\n",
         "experiments/one/run.py": "print(1)\n",
         "experiments/one/results/old.csv": "a\n1\n",
+        "experiments/fingerprints/run.py": FINGERPRINT,
     }.items():
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -129,16 +140,6 @@ def test_intermediate_files_survive_an_interruption_of_the_first_command(study, 
     assert part.exists() and study.is_current()
 
 
-FINGERPRINT = """
-import json, sys
-from pathlib import Path
-from mstfilter.a import x
-out = Path(sys.argv[1])
-out.write_text(json.dumps(x))
-sys.exit("--against" in sys.argv and out.read_text() != Path(sys.argv[3]).read_text())
-"""
-
-
 @pytest.mark.parametrize(
     "name, text, same",
     [
@@ -148,9 +149,6 @@ sys.exit("--against" in sys.argv and out.read_text() != Path(sys.argv[3]).read_t
     ],
 )
 def test_equal_fingerprints_keep_the_results(study, tmp_path, name, text, same):
-    script = tmp_path / "experiments/fingerprints/run.py"
-    script.parent.mkdir()
-    script.write_text(FINGERPRINT)
     study.run()
     record.compare([study])
     (tmp_path / name).write_text(text)
@@ -164,6 +162,19 @@ def test_equal_fingerprints_keep_the_results(study, tmp_path, name, text, same):
     assert study.is_current() is same and study.record()["commit"] == made
     if same:  # a second change of structure is compared with the first
         assert study.base == record._git("rev-parse", "--short=8", "HEAD") != made
+
+
+def test_the_program_of_a_copy_is_asked_by_its_own_script(study, tmp_path):
+    """Which files count has changed since: the hash of the copy is that which its own `record.py` computes."""
+    study.run()
+    (tmp_path / "experiments/record.py").write_text(
+        "class Study:\n    def program(self):\n        return 'then'\n\n\n"
+        "def studies():\n    return {'one': Study()}\n"
+    )
+    (tmp_path / "mstfilter/a.py").write_text("x = 2\n")
+    assert not study.is_made_by(tmp_path)
+    record.write_json(study.folder / "record.json", {**study.record(), "program": "then"})
+    assert study.is_made_by(tmp_path) and not study.is_current()
 
 
 @pytest.mark.parametrize("current", [True, False])

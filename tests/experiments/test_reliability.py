@@ -10,7 +10,7 @@ from tests.experiments.scripts import EXPERIMENTS, own_modules
 
 POINTS = {"run": 6, "run --replace": 6, "study": 2, "simulate": 2, "save_recording": 9, "demo": 3, "write_masks": 18}
 
-LONG = ("study", "simulate", "demo")
+LONG = ("run", "run --replace", "study", "simulate", "demo")
 
 
 @pytest.fixture(scope="module")

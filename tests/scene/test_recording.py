@@ -24,7 +24,8 @@ from mstfilter.formats import (
 )
 from mstfilter.scene import TABLE_TOLERANCE, Frame, Hypothesis, check_grid, find_world, render
 from mstfilter.scene.camera import Camera, look_at
-from mstfilter.scene.geometry import fit_support_plane, table_residual, workspace
+from mstfilter.scene.geometry import workspace
+from mstfilter.scene.planes import fit_support_plane, table_residual
 from mstfilter.scene.recording import Recording
 from mstfilter.scene.voxels import VoxelGrid
 from tests.scene.scenes import CAMERA, GRID, table_scene

@@ -8,12 +8,14 @@ from datetime import datetime
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import RigidTransform
 
 from mstfilter.base.errors import InputError, InputWarning
 from mstfilter.formats import RecordingWriter, open_recording, save_recording
 from mstfilter.scene import Frame, examine
 from mstfilter.scene.camera import Camera, look_at
 from mstfilter.scene.frame import depth_sigma
+from mstfilter.scene.planes import fit_support_plane
 from mstfilter.scene.recording import Recording
 from tests.app.test_cli import call
 from tests.formats.layouts import video
@@ -226,7 +228,19 @@ def test_a_wall_that_is_farther_is_not_part_of_the_table():
     assert grids[1].upper[1] < 0.6 and grids[0] == grids[1]
 
 
-def test_a_floor_is_recognised_also_before_a_large_wall():
+@pytest.mark.parametrize(("wall", "floor"), [(1.0, -0.6), (9.0, -0.5), (0.45, -3.0)])
+def test_the_table_is_found_before_a_large_floor_and_a_large_wall(wall, floor):
+    """The table, at 1.1 m below the camera, has fewer readings than the plane that is behind it."""
+    rgb, depth, camera = room(wall, floor, 0.3)
+    unposed = Camera(camera.K, camera.width, camera.height)
+    fitted = fit_support_plane(Frame(rgb, depth, unposed)).T_world_camera
+    up, expected = (pose.rotation.inv().apply([0.0, 0.0, 1.0]) for pose in (fitted, camera.pose))
+    assert fitted.translation[2] == pytest.approx(1.1, abs=0.01) and np.degrees(np.arccos(up @ expected)) < 1
+    assert not any(one.stop for one in examine([Frame(rgb, depth, camera)], [0], GRID))
+
+
+def test_a_pose_that_places_the_floor_at_the_height_of_the_table_is_refused():
     rgb, depth, camera = room(1.0, -0.6)
+    low = RigidTransform.from_translation([0, 0, 0.6]) * camera.pose
     with pytest.raises(InputError, match="the floor is taken for the table: a second plane is 0.6"):
-        Recording.from_arrays(rgb, depth, camera.K)
+        Recording.from_arrays(rgb, depth, camera.K, T_world_camera=low, grid=GRID)

@@ -35,7 +35,11 @@ class TestBranching(TransitionContract):
         return Branching(Dynamics(AR1), 3)
 
 
-@pytest.mark.parametrize("scheme", [FearnheadClifford(), ClusterStratified()], ids=lambda s: type(s).__name__)
+@pytest.mark.parametrize(
+    "scheme",
+    [FearnheadClifford(), pytest.param(ClusterStratified(), marks=pytest.mark.nightly)],
+    ids=lambda s: type(s).__name__,
+)
 def test_selections_from_more_candidates_leave_the_evidence_unbiased(scheme):
     """Mean of L_hat / L within 4 standard errors of 1 (false alarm 6e-5 a case)."""
     mean, standard, _ = mean_ratio(branching(scheme, 100), YS[:4], kalman_ar1(YS[:4])[1], range(500))

@@ -5,17 +5,27 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import stats
-from scipy.special import gammaln, xlogy
+from scipy.special import gammaln, i0e, i1e, xlogy
 
 from mstfilter.base.errors import InputError
 from mstfilter.smc import (
     Bernoulli,
+    Beta,
+    Binomial,
     Categorical,
+    Dirichlet,
+    Gamma,
+    LogNormal,
+    Mixture,
     MultivariateNormal,
     Normal,
+    Poisson,
+    Product,
     StateSpaceModel,
     Student,
+    Truncated,
     Uniform,
+    VonMises,
     as_distribution,
     bootstrap,
 )
@@ -27,6 +37,20 @@ CASES = [
     (Uniform(-1.0, 2.5), stats.uniform(-1.0, 3.5)),
     (Bernoulli(0.3), stats.bernoulli(0.3)),
     (Categorical([0.2, 0.0, 0.5, 0.3]), stats.rv_discrete(values=(np.arange(4), [0.2, 0.0, 0.5, 0.3]))),
+    (Gamma(2.5, 0.7), stats.gamma(2.5, scale=0.7)),
+    (Gamma(0.3), stats.gamma(0.3)),
+    (LogNormal(0.2, 0.6), stats.lognorm(0.6, scale=np.exp(0.2))),
+    (Beta(2.0, 0.7), stats.beta(2.0, 0.7)),
+    (Poisson(2.5), stats.poisson(2.5)),
+    (Binomial(7, 0.3), stats.binom(7, 0.3)),
+    (Truncated(Normal(0.5, 1.0), -0.2, 2.2), stats.truncnorm(-0.7, 1.7, 0.5, 1.0)),
+    (Truncated(Normal(), 9.0, 9.5), stats.truncnorm(9.0, 9.5)),
+    (Truncated(Normal(), -9.5, -9.0), stats.truncnorm(-9.5, -9.0)),
+    (Truncated(stats.expon(scale=2.0), 0.5), stats.expon(0.5, 2.0)),
+    (
+        Mixture([1, 3], [Categorical([1.0]), Binomial(3, 0.5)]),
+        stats.rv_discrete(values=(np.arange(4), [0.25 + 3 / 32, 9 / 32, 9 / 32, 3 / 32])),
+    ),
 ]
 IDS = [type(ours).__name__ for ours, _ in CASES]
 
@@ -86,6 +110,93 @@ def test_draws_have_the_law(ours, theirs):
         np.testing.assert_allclose(ours.mean, theirs.mean())
 
 
+@pytest.mark.parametrize("concentration", [0.0, 1e-3, 0.5, 30.0])
+def test_angles(concentration):
+    """Density against scipy, anywhere on the line; draws by their mean cosine, which is I_1 / I_0 (5 sd)."""
+    ours, theirs = VonMises(3.0, concentration), stats.vonmises(max(concentration, 1e-12), 3.0)
+    x = np.linspace(-9, 9, 31)
+    np.testing.assert_allclose(ours.log_prob(x), theirs.logpdf(x), rtol=1e-9)
+    np.testing.assert_allclose(ours.log_prob(x), ours.log_prob(x + 2 * np.pi), rtol=1e-9)
+    drawn = np.cos(ours.sample(np.random.default_rng(0), 20_000) - 3.0)
+    assert abs(drawn.mean() - i1e(concentration) / i0e(concentration)) < 5 * drawn.std() / np.sqrt(20_000)
+    assert float(ours.mean) == 3.0
+
+
+@pytest.mark.parametrize("a", [[0.5, 2.0, 3.0], [0.02, 0.05, 0.01]])
+def test_shares(a):
+    """Against scipy and the exact mean and variance, also where Gamma variates of these shapes underflow (5 sd)."""
+    ours, x = Dirichlet(a), Dirichlet(a).sample(np.random.default_rng(0), 20_000)
+    inner = x[(x > 1e-290).all(axis=1)][:50]
+    np.testing.assert_allclose(ours.log_prob(inner), stats.dirichlet(a).logpdf(inner.T / inner.sum(axis=1)))
+    mean, variance = stats.dirichlet(a).mean(), stats.dirichlet(a).var()
+    np.testing.assert_allclose(ours.mean, [mean])
+    assert (abs(x.mean(axis=0) - mean) < 5 * np.sqrt(variance / 20_000)).all()
+    np.testing.assert_allclose(x.var(axis=0), variance, rtol=0.1)
+    assert ours.log_prob([0.5, 0.5, 0.5]) == ours.log_prob([1.5, -0.25, -0.25]) == -INF
+    rows = Dirichlet(np.stack([a, a[::-1]]))
+    np.testing.assert_allclose(rows.log_prob([0.2, 0.3, 0.5])[0], ours.log_prob([0.2, 0.3, 0.5]))
+
+
+def test_truncated_rows_and_boxes():
+    """Rows with bounds of their own against truncnorm; a box; counts above zero; NaN where nothing is left."""
+    x, low = np.linspace(-3, 3, 7), np.linspace(-4, 5, 7)
+    ours = Truncated(Normal(x, 2.0), low, low + 1.0)
+    values = ours.sample(np.random.default_rng(1), 7)
+    theirs = stats.truncnorm((low - x) / 2, (low + 1 - x) / 2, x, 2.0)
+    np.testing.assert_allclose(ours.log_prob(values), theirs.logpdf(values))
+    np.testing.assert_allclose(ours.mean, theirs.mean(), rtol=1e-6)
+    box = Truncated(Normal(np.zeros((1, 2)), 1.0), low=[[0.0, -1.0]], high=np.array([[INF, 1.0]]))
+    inside = box.sample(np.random.default_rng(2), 500)
+    assert (inside[:, 0] >= 0).all() and (abs(inside[:, 1]) <= 1).all()
+    mass = 0.5 * (2 * stats.norm.cdf(1) - 1)
+    np.testing.assert_allclose(box.log_prob(inside), stats.norm.logpdf(inside).sum(axis=1) - np.log(mass))
+    assert box.log_prob([-0.1, 0.0])[0] == -INF
+    seen = Truncated(Poisson(np.array([0.1, 3.0])), low=1)
+    np.testing.assert_allclose(np.exp([seen.log_prob(k) for k in range(40)]).sum(axis=0), 1.0)
+    np.testing.assert_allclose(seen.mean, np.array([0.1, 3.0]) / -np.expm1([-0.1, -3.0]))
+    assert (seen.sample(np.random.default_rng(3), 2) >= 1).all() and np.isneginf(seen.log_prob(0)).all()
+    nothing = Truncated(Normal(np.array([0.0, 1.0]), 0.1), 8.0, 9.0)
+    assert np.isnan(nothing.log_prob(8.5)).all()
+    with pytest.raises(InputError, match="no probability between 8.0 and 9.0 in row 0 .2 of 2."):
+        nothing.sample(np.random.default_rng(0), 2)
+    with pytest.raises(InputError, match="a VonMises cannot be truncated"):
+        Truncated(VonMises(), 0.0, 1.0)
+
+
+def test_mixtures():
+    """Law of a continuous mixture by its distribution function; weights by row; vectors; scipy parts; errors."""
+    ours = Mixture([0.3, 0.7], [Normal(-1.0, 0.5), stats.expon()])
+    x = ours.sample(np.random.default_rng(0), 4000)
+    assert stats.kstest(x, lambda v: 0.3 * stats.norm.cdf(v, -1.0, 0.5) + 0.7 * stats.expon.cdf(v)).pvalue > 1e-4
+    expected = np.log(0.3 * stats.norm.pdf(x, -1.0, 0.5) + 0.7 * stats.expon.pdf(x))
+    np.testing.assert_allclose(ours.log_prob(x), expected)
+    assert float(ours.mean) == pytest.approx(0.4)
+    rows = Mixture([[1.0, 0.0], [0.5, 0.5]], [Normal(np.array([0.0, 1.0]), 1.0), Normal(5.0, 1.0)])
+    np.testing.assert_allclose(rows.mean, [0.0, 3.0])
+    np.testing.assert_allclose(rows.log_prob(0.5)[0], stats.norm.logpdf(0.5))
+    vectors = Mixture([1, 1], [MultivariateNormal([0.0, 0.0], COV), MultivariateNormal([4.0, 0.0], COV)])
+    assert vectors.sample(np.random.default_rng(0), 6).shape == (6, 2) and vectors.parameter_shape == (1, 2)
+    np.testing.assert_allclose(vectors.mean, [[2.0, 0.0]])
+    both = [stats.multivariate_normal(m, COV).pdf([1.0, 0.2]) for m in ([0.0, 0.0], [4.0, 0.0])]
+    np.testing.assert_allclose(vectors.log_prob([1.0, 0.2]), np.log(np.mean(both)))
+    for weights, parts in (([1.0], [Normal(), Normal()]), ([1, 1], [Normal(), Poisson(1.0)])):
+        with pytest.raises(InputError, match="expected as many weights, and components of one kind"):
+            Mixture(weights, parts)
+
+
+def test_products():
+    """Entries of a vector have the sum of the log densities."""
+    vector = Product([Normal(0.0, 1.0), Gamma(2.0)])
+    values = vector.sample(np.random.default_rng(0), 5)
+    assert (values.shape, vector.event_shape, vector.value_shape(5)) == ((5, 2), (2,), (5, 2))
+    both = stats.norm.logpdf(values[:, 0]) + stats.gamma.logpdf(values[:, 1], 2.0)
+    np.testing.assert_allclose(vector.log_prob(values), both)
+    np.testing.assert_allclose(vector.log_prob(values[0]), both[0])
+    np.testing.assert_allclose(vector.mean, [[0.0, 2.0]])
+    with pytest.raises(InputError, match="give vectors a name"):
+        Product([Dirichlet([1.0, 1.0])])
+
+
 def test_gaussian_vectors():
     rng = np.random.default_rng(1)
     shared = MultivariateNormal([1.0, -1.0], COV)
@@ -127,6 +238,20 @@ def test_categorical_rows():
         (MultivariateNormal(0.0, COV), (1,), (2,)),
         (MultivariateNormal(np.zeros((5, 2)), COV), (5,), (2,)),
         (MultivariateNormal([0.0, 0.0], np.tile(COV, (5, 1, 1))), (5,), (2,)),
+        (Gamma(np.ones(5), 2.0), (5,), ()),
+        (Beta(np.ones((1, 3)), np.ones((5, 3))), (5,), (3,)),
+        (Poisson(np.ones(5)), (5,), ()),
+        (Binomial(3, np.full(5, 0.5)), (5,), ()),
+        (LogNormal(np.zeros((5, 1))), (5,), (1,)),
+        (VonMises(np.zeros(5), 2.0), (5,), ()),
+        (Dirichlet([1.0, 2.0]), (1,), (2,)),
+        (Dirichlet(np.ones((5, 2))), (5,), (2,)),
+        (Truncated(Normal(), np.linspace(-3, 0, 5), 1.0), (5,), ()),
+        (Truncated(Normal(np.zeros((5, 2))), 0.0), (5,), (2,)),
+        (Mixture(np.ones((5, 2)), [Normal(), Normal(1.0)]), (5,), ()),
+        (Mixture([1, 2], [Normal(np.zeros((5, 2))), Student(np.ones((1, 2)))]), (5,), (2,)),
+        (Product([Normal(), Gamma(np.ones(5))]), (5,), (2,)),
+        (Product([Normal(), Gamma(1.0)]), (1,), (2,)),
         (as_distribution(stats.norm(np.zeros((5, 2)), 1.0)), (5,), (2,)),
         (as_distribution(stats.rv_discrete(values=([0, 1], [0.5, 0.5]))), (), ()),
         (as_distribution(stats.multivariate_normal([0.0, 1.0], COV)), (1,), (2,)),
@@ -180,6 +305,17 @@ def with_row(good, bad, row=2):
         (lambda v: MultivariateNormal([0.0, 0.0], with_row(COV, v)), "not positive definite", BAD_COV),
         (lambda v: MultivariateNormal([0.0, 0.0], with_row(COV, v)), "not symmetric", [[1.0, 0.5], [0.0, 1.0]]),
         (lambda v: MultivariateNormal([0.0, 0.0], with_row(COV, v)), "covariance", NAN),
+        *[(lambda v: Gamma(with_row(1.0, v)), "shape of a Gamma", v) for v in (0.0, -1.0, NAN, INF)],
+        (lambda v: Gamma(1.0, with_row(1.0, v)), "scale of a Gamma", -2.0),
+        (lambda v: LogNormal(0.0, with_row(1.0, v)), "scale of a", -2.0),
+        (lambda v: Beta(with_row(2.0, v), 1.0), "a of a Beta", NAN),
+        *[(lambda v: Poisson(with_row(2.0, v)), "rate of a Poisson", v) for v in (-1.0, NAN, INF)],
+        *[(lambda v: Binomial(with_row(2.0, v), 0.5), "n of a Binomial", v) for v in (1.5, -1.0, NAN)],
+        (lambda v: Binomial(2, with_row(0.5, v)), "p of a Binomial", 1.1),
+        (lambda v: VonMises(0.0, with_row(2.0, v)), "concentration of a VonMises", -1.0),
+        (lambda v: Dirichlet(with_row([1.0, 1.0], v)), "concentration of a Dirichlet", 0.0),
+        (lambda v: Truncated(Normal(0.0, with_row(1.0, v)), -1.0), "scale of a Normal", -1.0),
+        (lambda v: Mixture([1, 1], [Normal(), Normal(with_row(1.0, v))]), "loc of a Normal", NAN),
     ],
 )
 def test_a_parameter_out_of_range_names_its_row(make, named, value):

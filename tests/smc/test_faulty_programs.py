@@ -49,7 +49,15 @@ def test_check_names_every_fault(name):
     assert failures(filter, ys)
 
 
-@pytest.mark.parametrize("name", CORRECT)
+#: Programs and distributions that take seconds to check.
+SLOW = ("a_network_in_single_precision", "many peaks")
+
+
+def fast_or_nightly(names):
+    return [pytest.param(name, marks=[pytest.mark.nightly] * (name in SLOW)) for name in names]
+
+
+@pytest.mark.parametrize("name", fast_or_nightly(CORRECT))
 def test_check_finds_nothing_in_a_correct_program(name):
     assert failures(*CORRECT[name]) == []
 
@@ -135,7 +143,7 @@ SKEWED = {
 }
 
 
-@pytest.mark.parametrize("name", SKEWED)
+@pytest.mark.parametrize("name", fast_or_nightly(SKEWED))
 def test_heavy_tails_poles_and_jumps_of_a_density_are_no_fault(name):
     for seed in range(2):
         check_density("x", Of(SKEWED[name]), np.random.default_rng(seed))

@@ -56,8 +56,12 @@ FILTERS = {
 }
 
 
-@pytest.mark.parametrize("trigger", [Always(), EssBelow(0.5)], ids=lambda t: type(t).__name__)
-@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize(
+    ("name", "trigger"),
+    [(name, EssBelow(0.5)) for name in FILTERS]
+    + [pytest.param(name, Always(), marks=[pytest.mark.nightly] * (name != "bootstrap")) for name in FILTERS],
+    ids=lambda value: value if isinstance(value, str) else type(value).__name__,
+)
 def test_every_filter_agrees_with_kalman(name, trigger):
     """Mean of L_hat / L within 4 standard errors of 1 (false alarm 6e-5 a case), means and variances within 5."""
     filter = FILTERS[name](trigger)

@@ -19,11 +19,13 @@ from mstfilter.smc import (
     Categorical,
     ConditionallyLinear,
     Dynamics,
+    Gamma,
     Kld,
     LargestWeights,
     Linear,
     Normal,
     Population,
+    Product,
     Program,
     Proposal,
     Reweight,
@@ -121,7 +123,7 @@ def as_path(name, states):
     return {"k": states} if name in ("program", "guided program", "switch") else states
 
 
-@pytest.mark.parametrize("name", ["vector", "no density", "guided"])
+@pytest.mark.parametrize("name", ["vector", pytest.param("no density", marks=pytest.mark.nightly), "guided"])
 def test_conditional_smc_keeps_the_law_of_paths(name):
     """Chi-square of the paths after three sweeps from paths that are drawn from the exact posterior."""
     n = 300
@@ -153,15 +155,15 @@ def test_conditional_smc_keeps_the_law_of_paths(name):
     ],
 )
 def test_conditional_smc_is_the_same_for_every_form_of_a_model(name, same):
-    """The same paths from the same streams, in chains of 60 sweeps; values that a program returns have no density."""
+    """The same paths from the same streams, in chains of 30 sweeps; values that a program returns have no density."""
     one, other = (conditional_path(CONDITIONAL[form], SYMBOLS) for form in (name, same))
     distinct = set()
-    for seed in range(60):
+    for seed in range(30):
         one = conditional_path(CONDITIONAL[name], SYMBOLS, seed, one)
         other = conditional_path(CONDITIONAL[same], SYMBOLS, seed, other)
         np.testing.assert_array_equal(states_of(one), other)
         distinct.add(tuple(other))
-    assert len(distinct) > 3
+    assert len(distinct) >= 3
 
 
 def test_path_log_prob_is_the_joint_density():
@@ -347,7 +349,9 @@ def metropolis(rng, theta, path):
     return new if np.log(rng.random()) < gain + log_prior(new) - log_prior(theta) else theta
 
 
-@pytest.mark.parametrize(("draw", "n_iterations"), [(conjugate, 50), (metropolis, 30)])
+@pytest.mark.parametrize(
+    ("draw", "n_iterations"), [(conjugate, 50), pytest.param(metropolis, 30, marks=pytest.mark.nightly)]
+)
 def test_particle_gibbs_has_the_exact_posterior(draw, n_iterations):
     means, squares = [], []
     for seed in range(10):
@@ -412,7 +416,7 @@ def test_a_path_survives_if_all_free_particles_have_weight_zero():
     model = StateSpaceModel.of(Uniform(0.0, 1.0), lambda x: Uniform(x - 0.5, x + 0.5), lambda x: Normal(x, 1.0))
     filter = guided(model, lambda x, y: Normal(x, 2.0), 2)
     path, paths = np.array([0.5, 0.6, 0.7]), []
-    for seed in range(3000):
+    for seed in range(1500):
         path = conditional_path(filter, [0.5, 0.5, 0.5], seed, path)
         paths.append(path)
     # x_0 by the exact law, on a grid: p(x_0) times the likelihoods of all paths
@@ -421,28 +425,101 @@ def test_a_path_survives_if_all_free_particles_have_weight_zero():
     like = np.exp(-0.5 * (grid - 0.5) ** 2)
     law = ((grid >= 0) & (grid <= 1)) * like * (move @ (like * (move @ like)))
     mean = (grid * law).sum() / law.sum()
-    assert np.mean([p[0] for p in paths]) == pytest.approx(mean, abs=0.05)
+    assert np.mean([p[0] for p in paths]) == pytest.approx(mean, abs=0.07)
 
 
 @pytest.mark.parametrize("infer", [pmmh, ensemble, particle_gibbs])
-def test_parameters_are_an_array_of_numbers(infer):
-    """Names have no order: a mapping is refused before the first run of a filter."""
+def test_parameters_are_numbers(infer):
+    """What is no number is refused before the first run of a filter."""
 
     def call(start, **given):
-        arguments = {"log_prior": lambda theta: 0.0, "scale": [0.1, 0.1], "draw": None, "n_iterations": 3}
+        arguments = {"prior": lambda theta: 0.0, "scale": [0.1, 0.1], "draw": None, "n_iterations": 3}
         taken = inspect.signature(infer).parameters
         named = {name: value for name, value in {**arguments, **given}.items() if name in taken}
         infer(lambda theta: None, [0.0], start=start, **named)
 
-    with pytest.raises(InputError, match="start is a mapping with the keys rho, sigma") as found:
-        call({"rho": 0.5, "sigma": 1.0})
-    assert "start=[0.5, 1.0]" in found.value.hints[0] and "rho, sigma = theta" in found.value.hints[1]
     with pytest.raises(InputError, match="start is 'rho', expected an array of numbers"):
         call("rho")
     with pytest.raises(InputError, match="expected finite numbers"):
         call([0.5, np.nan])
     with pytest.raises(InputError, match="start has shape"):
         call(np.zeros((2, 3, 4)))
+    if infer is particle_gibbs:
+        with pytest.raises(InputError, match="start is a mapping with the keys rho, sigma"):
+            call({"rho": 0.5, "sigma": 1.0})
+        return
+    with pytest.raises(InputError, match="start has the names .'rho'., expected .'rho', 'sigma'."):
+        call({"rho": 0.5}, prior={"rho": Normal(), "sigma": Gamma(1.0)})
+    with pytest.raises(InputError, match="start of rho has shape .2, 2., expected one number per chain"):
+        call({"rho": np.zeros((2, 2))})
+    with pytest.raises(InputError, match="start has arrays of different lengths"):
+        call({"rho": np.zeros(2), "sigma": np.zeros(3)})
+    with pytest.raises(InputError, match="start is missing"):
+        call(None)
+    with pytest.raises(InputError, match="expected a distribution, found a builtins.float"):
+        call([0.1, 0.2], prior=0.5)
     if infer is pmmh:
         with pytest.raises(InputError, match="scale is a mapping with the keys rho, sigma"):
             call([0.5, 1.0], scale={"rho": 0.1, "sigma": 0.1})
+        with pytest.raises(InputError, match=r"the log prior has shape \(2,\)"):
+            call([0.5, 1.0], prior=Normal([0.0, 0.0], 1.0))
+        with pytest.raises(InputError, match="scale is missing"):
+            call([0.5, 1.0], scale=None)
+
+
+def named_filter(theta):
+    """The AR(1) filter whose coefficient has a name, and whose noise is known."""
+    assert set(theta) == {"rho", "tau"}
+    return filter_of([theta["rho"]])
+
+
+PRIOR = {"rho": Normal(0.4, 0.4), "tau": Gamma(2.0, 0.5)}
+
+
+def test_names_of_parameters_are_kept():
+    """The chain of named parameters is that of the array, bit for bit; a parameter without data keeps its prior."""
+
+    def by_array(theta):
+        return filter_of(theta[:1])
+
+    def log_density(theta):
+        return stats.norm.logpdf(theta[0], 0.4, 0.4) + stats.gamma.logpdf(theta[1], 2.0, scale=0.5)
+
+    start, scale = {"tau": [0.5, 1.0], "rho": 0.4}, {"tau": 0.3, "rho": 0.5}
+    named = pmmh(named_filter, YS, PRIOR, start, scale, 20)
+    plain = pmmh(by_array, YS, log_density, [[0.4, 0.5], [0.4, 1.0]], [0.5, 0.3], 20)
+    np.testing.assert_array_equal(named.theta, plain.theta)
+    np.testing.assert_allclose(named.log_density, plain.log_density)
+    np.testing.assert_array_equal(named["tau"], named.theta[:, :, 1])
+    assert named.names == ("rho", "tau") and plain.names == () and "rho, tau, accepted" in repr(named)
+    assert list(named.columns()) == ["chain", "draw", "rho", "tau", "log_evidence", "log_density"]
+    with pytest.raises(KeyError, match="no parameter 'sigma'; there are: rho, tau"):
+        named["sigma"]
+    function = pmmh(named_filter, YS, lambda theta: log_density([theta["rho"], theta["tau"]]), start, scale, 20)
+    assert function.names == ("tau", "rho")  # without a distribution, the names are those of the start
+
+
+def test_first_parameters_are_draws_from_the_prior():
+    one = pmmh(named_filter, YS, PRIOR, scale={"rho": 1e-9, "tau": 1e-9}, n_iterations=1)
+    assert one.theta.shape == (1, 1, 2) and one["tau"] > 0
+    many = pmmh(named_filter, YS, PRIOR, scale=[0.1, 0.1], n_iterations=2, n_chains=3, batched=True)
+    assert many.theta.shape == (2, 3, 2)
+    walkers = ensemble(named_filter, YS, PRIOR, n_iterations=2)
+    assert walkers.theta.shape == (2, 8, 2) and walkers.names == ("rho", "tau")
+    assert ensemble(named_filter, YS, PRIOR, n_iterations=1, n_walkers=6).theta.shape == (1, 6, 2)
+    vectors = pmmh(
+        lambda theta: filter_of(theta[:1]), YS, Product([*PRIOR.values()]), scale=[0.1, 0.1], n_iterations=2
+    )
+    assert vectors.theta.shape == (2, 1, 2) and not vectors.names
+    number = pmmh(filter_of, YS, stats.norm(0.4, 0.4), scale=0.1, n_iterations=2)
+    assert number.theta.shape == (2, 1, 1)
+
+
+def test_named_priors_have_the_exact_posterior():
+    """In batches: rho against the grid; tau, of which the data say nothing, against its prior."""
+    start = {"rho": STARTS[:, 0], "tau": np.random.default_rng(1).gamma(2.0, 0.5, 40)}
+    chains = pmmh(named_filter, YS, PRIOR, start, {"rho": 0.5, "tau": 0.6}, 120, batched=True)
+    rho, tau = chains["rho"], chains["tau"]
+    assert agrees(rho.mean(axis=0), ((rho - MEAN) ** 2).mean(axis=0))
+    means = tau.mean(axis=0)
+    assert abs(means.mean() - 1.0) < 5 * means.std(ddof=1) / np.sqrt(40)

@@ -98,7 +98,7 @@ def _print_tables(folder: Any) -> None:
 
 @app.command()
 def train(
-    part: Annotated[str, typer.Argument(help="What to train: completion or border.")],
+    part: Annotated[str, typer.Argument(help="What to train: completion, border or seams.")],
     overrides: Annotated[
         list[str] | None, typer.Argument(metavar="[NAME=VALUE]...", help="Changes to the settings: steps=10000")
     ] = None,
@@ -110,7 +110,7 @@ def train(
     """Train a network on simulated scenes; the same command resumes a training that was stopped."""
     from mstfilter.base.errors import check_choice
 
-    check_choice("part", part, ("completion", "border"))
+    check_choice("part", part, ("completion", "border", "seams"))
     from mstfilter.base.resources import training_program
 
     trained = getattr(training_program(part), f"{part.capitalize()}Training")
@@ -126,6 +126,7 @@ def train(
         "completion": f"use it with update.completer=network update.completer.weights={folder}",
         "border": f"next: python experiments/segmentation_fit/run.py --border {folder}, then use it with "
         f"proposal.tree.weights={folder}",
+        "seams": f"use it with proposal.tree=seams proposal.tree.weights={folder}",
     }
     print(f"model       {folder}; {use[part]}")
     for name, value in (figures or {}).items():

@@ -18,8 +18,8 @@ from typing import Any
 
 import matplotlib.style
 import numpy as np
-from matplotlib.figure import Figure
 
+from mstfilter.app.report.charts import Drawing
 from mstfilter.app.report.identities import match_objects, weigh_distinct
 from mstfilter.app.report.page import short_text
 from mstfilter.app.report.pictures import colour, data_uri, jpeg_bytes, png_bytes, viewpoint, voxel_picture
@@ -28,17 +28,6 @@ from mstfilter.scene import Clip, Frame, Hypothesis, Recording
 from mstfilter.smc import Infos, Population, State, as_matrix
 
 _MOST_PICTURES = 6
-
-
-class Drawing(Figure):
-    """A matplotlib figure that a notebook shows as a picture, with or without pyplot."""
-
-    def _repr_png_(self) -> bytes:
-        import io
-
-        file = io.BytesIO()
-        self.savefig(file, format="png", dpi=110, bbox_inches="tight")
-        return file.getvalue()
 
 
 @matplotlib.style.context("mstfilter.app.report.figures")

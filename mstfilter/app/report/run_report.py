@@ -67,9 +67,8 @@ def _pauses(run: RunFolder, numbers: RunNumbers) -> list[dict[str, Any]]:
     view = viewpoint(volumes, run.camera(0)) if scenes else None
     pauses = []
     for t, (step, scene) in enumerate(zip(numbers.steps, scenes, strict=True)):
-        population = run.state(t).population
-        assert scene.camera is not None and view is not None and population is not None
-        doubt = _doubt(Belief(population), scene.camera)
+        assert scene.camera is not None and view is not None
+        doubt = _doubt(run.belief(t), scene.camera)
         pauses.append({"t": t, "step": step, "doubt": doubt, **scene_content(scene, volumes, view)})
     return pauses
 

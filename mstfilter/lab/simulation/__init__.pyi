@@ -27,7 +27,6 @@ from mstfilter.lab.simulation.sensor import (
     DepthSensor as DepthSensor,
     colour_reading as colour_reading,
 )
-from mstfilter.lab.simulation.surfaces import cache_folder as cache_folder
 from mstfilter.lab.simulation.world import (
     FingerPush as FingerPush,
     PushEffect as PushEffect,

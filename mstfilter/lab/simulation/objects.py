@@ -30,10 +30,10 @@ from typing import Any, Literal
 import numpy as np
 
 from mstfilter.base.errors import InputError, missing_library
-from mstfilter.base.files import read_csv, reading
+from mstfilter.base.files import cache_folder, read_csv, reading
 from mstfilter.base.reading import read_arrays
 from mstfilter.lab.simulation.shapes import Shape
-from mstfilter.lab.simulation.surfaces import MeshSurface, Triangles, cache_folder, centred, prepared_mesh
+from mstfilter.lab.simulation.surfaces import MeshSurface, Triangles, centred, prepared_mesh
 
 MeshPool = Literal["training", "tuning", "reported", "all"]
 

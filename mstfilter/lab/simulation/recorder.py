@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.base.errors import InputError, InputWarning, check_integer
-from mstfilter.base.files import atomic_folder, damaged_files, make_folders, sweep, write_text
+from mstfilter.base.files import atomic_folder, cache_folder, damaged_files, make_folders, sweep, write_text
 from mstfilter.base.reading import check_private
 from mstfilter.formats import RecordingWriter, open_recording
 from mstfilter.lab.simulation.arrangement import SceneObjects, arrange_objects, draw_objects
@@ -44,7 +44,6 @@ from mstfilter.lab.simulation.lighting import Stage
 from mstfilter.lab.simulation.renderer import Renderer, View, visible_texel
 from mstfilter.lab.simulation.sensor import colour_reading
 from mstfilter.lab.simulation.shapes import label_voxels
-from mstfilter.lab.simulation.surfaces import cache_folder
 from mstfilter.lab.simulation.textures import Room, draw_room
 from mstfilter.lab.simulation.world import (
     FINGER_ID,

@@ -11,7 +11,6 @@ seconds. So a prepared surface is stored in the user's cache folder, under a has
 from __future__ import annotations
 
 import functools
-import os
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -313,13 +312,6 @@ def prepare_mesh(mesh: Triangles, agreement_at_least: float = 0.0) -> MeshSurfac
     cells, normals, colours = _surface_cells(mesh, half)
     hulls = _convex_pieces(mesh.vertices, mesh.faces)
     return MeshSurface(mesh.vertices, mesh.faces.astype(np.int32), half, hulls, inside, cells, normals, colours)
-
-
-def cache_folder() -> Path:
-    """Folder of cached files: the variable MSTFILTER_CACHE, or else `mstfilter` in the user's cache folder."""
-    if folder := os.environ.get("MSTFILTER_CACHE"):
-        return Path(folder)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mstfilter"
 
 
 def prepared_mesh(mesh: Triangles, folder: Path, agreement_at_least: float = 0.0) -> MeshSurface:

@@ -7,6 +7,7 @@
 =============  =========================================================================================
 `queries`      `Belief`: probabilities, expected information, the estimate
 `information`  entropies and mutual information of weighted outcomes
+`pushes`       `push_candidates`: pushes that decide between one object and two
 `similarity`   similarity and equality of hypotheses, for resamplers that compare particles
 =============  =========================================================================================
 """

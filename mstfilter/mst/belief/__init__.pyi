@@ -1,2 +1,3 @@
+from mstfilter.mst.belief.pushes import PushCandidate as PushCandidate, push_candidates as push_candidates
 from mstfilter.mst.belief.queries import Belief as Belief, Border as Border
 from mstfilter.mst.belief.similarity import SameSegmentation as SameSegmentation, WeightedCoverage as WeightedCoverage

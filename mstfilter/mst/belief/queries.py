@@ -14,6 +14,13 @@ and the normalised weight w_i. Each hypothesis numbers its objects as it likes, 
 Questions about the occupancy of voxels also use the occupancy probabilities of each hypothesis
 (`Hypothesis.occupancy`); those about segmentations and actions use the labels alone.
 
+A filter keeps few hypotheses, so their weights are coarse. But the update of `mst` weighs up to 100 segmentations of
+the last image before it keeps some. If a belief is given these too, it answers questions about pixels of that image
+from all of them:
+
+>>> belief = Belief.of_step(state, info)                          # as `Stream.belief`, `RunFolder.belief(t)`
+>>> belief.kept.open_borders(camera)                              # what the kept hypotheses alone say
+
 Voxels are integer indices (x, y, z), which `Belief.voxel` finds for points in metres. Pixels are (column, row). A
 region is a bool array of the grid's shape, or voxels (..., 3). Entropy and information are in nats (divide by log 2
 for bits). What the information of an action is, and its `tolerance` (in voxels or pixels), is explained in
@@ -45,6 +52,7 @@ from mstfilter.scene import (
     CommonRefinement,
     Hypothesis,
     VoxelGrid,
+    WeightedSegmentations,
     check_grids,
     common_refinement,
     memo,
@@ -53,7 +61,7 @@ from mstfilter.scene import (
     scaled_area,
 )
 from mstfilter.scoring import least_loss
-from mstfilter.smc import Population, first_seen
+from mstfilter.smc import Info, Population, State, first_seen
 
 Action = TypeVar("Action")
 
@@ -66,6 +74,8 @@ class Border(NamedTuple):
 
     one_object: float  #: probability that both sides are one object, if both are objects
     pixels: np.ndarray  #: (m, 2) pixels (column, row) on the border
+    #: (2, H, W) bool, the two objects on its sides in the most probable segmentation in which they are two
+    sides: np.ndarray
 
     @property
     def middle(self) -> np.ndarray:
@@ -85,9 +95,13 @@ class Belief:
     population : Population
         Hypotheses on one grid with unnormalised log weights, such as ``state.population``. Those that are equal are
         merged, and those of weight 0 are ignored.
+    seen : WeightedSegmentations, optional
+        All segmentations of the last image that the filter has weighed. If asked with the camera of this image,
+        `same_object_at_pixels`, `open_borders` and `disagreement` answer from them.
     """
 
     population: Population
+    seen: WeightedSegmentations | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.population, Population):
@@ -98,6 +112,18 @@ class Belief:
         if not all(isinstance(h, Hypothesis) for h in particles):
             raise InputError("the particles of a belief must be hypotheses, not vectors or other objects")
         check_grids("", particles, self.grid)
+
+    @classmethod
+    def of_step(cls, state: State, info: Info) -> Belief:
+        """The belief after a step, with all segmentations that the update has weighed, if it notes them."""
+        if state.population is None:
+            raise InputError("the state has no particles before the first step", "state, info = filter.step(...)")
+        return cls(state.population, info.notes.get("update", {}).get("segmentations"))
+
+    @property
+    def kept(self) -> Belief:
+        """The belief of the kept hypotheses alone."""
+        return Belief(self.population)
 
     def __repr__(self) -> str:
         weights = ", ".join(f"{w:.3g}" for w in np.sort(self._mass)[::-1][:8]) + ", ..." * (len(self._mass) > 8)
@@ -194,10 +220,10 @@ class Belief:
 
         R_i is the label image of hypothesis i. `a` and `b` (..., 2) are pixels (column, row); they are broadcast.
         """
-        images = self._images(camera)
+        refined, mass = self.refined_image(camera)
         a, b = _rows_and_columns(camera, a), _rows_and_columns(camera, b)
-        same = [(image[a] == image[b]) & (image[a] > 0) for image in images]
-        return np.tensordot(self._mass, np.stack(same), axes=1)
+        objects_a, objects_b = refined.objects[:, refined.cells[a]], refined.objects[:, refined.cells[b]]
+        return np.tensordot(mass, (objects_a == objects_b) & (objects_a > 0), axes=1)
 
     def object_count(self) -> np.ndarray:
         """Probability (K + 1,) of k = 0 .. K objects: ``sum_i w_i [hypothesis i has k objects]``."""
@@ -237,15 +263,13 @@ class Belief:
         object that hypothesis i shows at the pixel, and J is the Jaccard index. J is 1 if neither hypothesis shows an
         object at the pixel, and 0 if only one hypothesis shows an object.
         """
-        refined = self._refined_image(camera)
+        refined, mass = self.refined_image(camera)
         shared = refined.overlaps()
         union = np.add.outer(shared.diagonal(), shared.diagonal()) - shared
         jaccard = np.divide(shared, union, out=np.ones_like(shared), where=union > 0)
         rows = refined.objects
         same = sum(
-            w * v * jaccard[a, b]
-            for w, a in zip(self._mass, rows, strict=True)
-            for v, b in zip(self._mass, rows, strict=True)
+            w * v * jaccard[a, b] for w, a in zip(mass, rows, strict=True) for v, b in zip(mass, rows, strict=True)
         )
         return np.clip(1 - same, 0, 1)[refined.cells]
 
@@ -259,21 +283,25 @@ class Belief:
         of one object with the same answer in all hypotheses are one border.
         """
         check_number("at_least", at_least, at_least=0, at_most=0.5)
-        refined = self._refined_image(camera)
+        refined, mass = self.refined_image(camera)
         least = scaled_area(_LEAST_PART, camera.width * camera.height)
         small = (refined.sizes < least)[refined.cells]
         nearest = distance_transform_edt(small, return_distances=False, return_indices=True)
         a, b, pixels = _neighbours(refined.cells if small.all() else refined.cells[tuple(nearest)])
         of_a, of_b = refined.objects[:, a], refined.objects[:, b]
         both, same = (of_a > 0) & (of_b > 0), (of_a > 0) & (of_a == of_b)
-        p_both, p_same = self._mass @ both, self._mass @ same
+        p_both, p_same = mass @ both, mass @ same
         one = np.divide(p_same, p_both, out=np.ones_like(p_same), where=p_both > at_least)
         borders: dict[bytes, list[int]] = {}  # pixels that ask the same question, about the same object
         for k in np.flatnonzero((p_both > at_least) & (one >= at_least) & (one <= 1 - at_least)).tolist():
             borders.setdefault(np.concatenate([both[:, k], same[:, k], of_a[same[:, k], k]]).tobytes(), []).append(k)
         doubt = {key: p_both[k[0]] * float(binary_entropy(one[k[0]])) for key, k in borders.items()}
         order = sorted(doubt, key=lambda key: -doubt[key])
-        return [Border(float(one[borders[k][0]]), pixels[borders[k]]) for k in order if len(borders[k]) ** 2 >= least]
+        return [
+            Border(float(one[borders[k][0]]), pixels[borders[k]], _sides(refined, mass, a, b, borders[k]))
+            for k in order
+            if len(borders[k]) ** 2 >= least
+        ]
 
     def partition_entropy(self, tolerance: float = 0.0) -> float:
         """Entropy of the segmentation of the scene, in nats.
@@ -363,14 +391,26 @@ class Belief:
         hypotheses, mass = self._merged
         return hypotheses[least_loss([h.labels for h in hypotheses], mass)]
 
-    def _refined_image(self, camera: Camera) -> CommonRefinement:
-        """The common refinement of the label images."""
+    def refined_image(self, camera: Camera) -> tuple[CommonRefinement, np.ndarray]:
+        """The cells of the segmentations that a camera sees, and the weights (n,) of the segmentations."""
+        if self.seen is not None and self.seen.are_of(camera):
+            return self.seen.refinement, self.seen.weights
         images, keys = self._images(camera), [h.key for h in self._merged[0]]
-        return memo("refined image", (camera.key, *keys), lambda: common_refinement(images))
+        return memo("refined image", (camera.key, *keys), lambda: common_refinement(images)), self._mass
 
     def _images(self, camera: Camera) -> list[np.ndarray]:
         check_component("camera", camera, Camera)
         return [project(h, camera) for h in self._merged[0]]
+
+
+def _sides(refined: CommonRefinement, mass: np.ndarray, a: np.ndarray, b: np.ndarray, at: list[int]) -> np.ndarray:
+    """Both objects (2, H, W) bool at the pairs `at` of neighbouring cells a, b, where they are most probably two."""
+    first, second = refined.objects[:, a[at]], refined.objects[:, b[at]]
+    two = (first > 0) & (second > 0) & (first != second)
+    best = int((mass * two.any(axis=1)).argmax())
+    k = at[int(two[best].argmax())]
+    row = refined.objects[best]
+    return np.stack([(row == row[cell])[refined.cells] for cell in (a[k], b[k])])
 
 
 def _check_indices(name: str, index: np.ndarray, shape: tuple[int, ...], hint: str) -> None:

@@ -10,6 +10,7 @@ say and gives partitions of the readings their probabilities. Shapes come last, 
 `update`       `PartitionUpdate`: the five steps, from free space to completed objects
 `cells`        the common refinement of all partitions, odds of pairs of cells, probabilities of partitions
 `candidates`   choices of a prediction, a partition and the hidden objects that stay, with their weights
+`motions`      which predicted objects have moved as one body
 `association`  which segment of the image continues which predicted object
 =============  =========================================================================================
 """

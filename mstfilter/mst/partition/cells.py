@@ -15,12 +15,13 @@ Are two cells one object? Let f_image be the share of the samples in which they 
 corresponding weighted share of the predictions. The log odds l of "one object" are a sum:
 
     ``l = (1 - R) (image_only_constant + image_only logit(f_image))
-    + R (constant + image logit(f_image)) + W (prediction logit(f_prediction) + prediction_constant)``
+    + R (constant + image logit(f_image)) + W (prediction logit(f_prediction) + prediction_constant) + M together``
 
-R is the probability that a prediction is valid, and W <= R the total weight of the predictions with an object at both
-cells. The update gives one prediction at a time a weight above 0, so there f_prediction is 0 or 1. In the logit, 0.02
-is added to f and to 1 - f. The coefficients are the fields of `PairEvidence`; by default, logit(f_image) is not
-scaled. The coefficient of the predictions was fitted to pairs of cells, and the constants were chosen by a study
+R is the probability that a prediction is valid, W <= R the total weight of the predictions with an object at both
+cells, and M <= W that of the predictions in which both have moved as one body. The update gives one prediction at a
+time a weight above 0, so there f_prediction is 0 or 1. In the logit, 0.02 is added to f and to 1 - f. The
+coefficients are the fields of `PairEvidence`; by default, logit(f_image) is not scaled. The coefficient of the
+predictions was fitted to pairs of cells, and the constants were chosen by a study
 (`experiments/weights` and the page of settled studies in the docs).
 
 The alternatives of a component are its partitions in the samples and in the predictions. Where a prediction has no
@@ -75,6 +76,12 @@ class Readings:
         mask.ravel()[self.pixels[chosen]] = True
         return mask
 
+    def image(self, values: np.ndarray) -> np.ndarray:
+        """Image (H, W) with a value (m,) int at the pixel of each reading, and 0 elsewhere."""
+        found = np.zeros(self.shape, np.int64)
+        found.ravel()[self.pixels] = values
+        return found
+
     def of_image(self, image: np.ndarray) -> np.ndarray:
         """Value (m,) of an image (H, W) at each reading."""
         return np.asarray(image.ravel()[self.pixels])
@@ -125,6 +132,8 @@ class Cells:
     samples: np.ndarray  #: (s, K) label of each cell in each sample
     predictions: np.ndarray  #: (n, K) label of each cell in each prediction, 0 is none
     weights: np.ndarray | None = None  #: (s,) weights of the samples; None if they are equal
+    #: For each prediction, the body of each of its labels (`common_motions`); empty if that is not known.
+    bodies: tuple[np.ndarray, ...] = ()
 
     @classmethod
     def of(
@@ -133,6 +142,7 @@ class Cells:
         samples: Sequence[np.ndarray],
         predictions: Sequence[np.ndarray],
         weights: np.ndarray | None = None,
+        bodies: Sequence[np.ndarray] = (),
     ) -> Cells:
         """Cells from the labels (m,) of the readings in each sample and each prediction; 0 means no object.
 
@@ -148,7 +158,8 @@ class Cells:
         of_reading[kept] = np.unique(cell, return_inverse=True)[1]
         example = _examples(cell, exact)
         labels = np.stack([*segments, *objects])[:, example]
-        return cls(readings, of_reading, labels[: len(segments)], labels[len(segments) :], weights)
+        samples_of, predictions_of = labels[: len(segments)], labels[len(segments) :]
+        return cls(readings, of_reading, samples_of, predictions_of, weights, tuple(bodies))
 
     @cached_property
     def sizes(self) -> np.ndarray:
@@ -322,6 +333,7 @@ class PairTerms(NamedTuple):
     image: np.ndarray  #: probability that a prediction is valid, times the logit of f_image
     prediction: np.ndarray  #: weight of the predictions with an object at both cells, times the logit of f_prediction
     prediction_constant: np.ndarray  #: weight of the predictions with an object at both cells
+    together: np.ndarray  #: weight of the predictions in which both cells have moved as one body
 
 
 @dataclass(frozen=True)
@@ -334,6 +346,7 @@ class PairEvidence(PairOdds):
     image: float = 1.0
     prediction: float = 0.62
     prediction_constant: float = 0.0
+    together: float = 0.0
 
     def log_odds(self, cells: Cells, weights: np.ndarray, clip: Clip) -> np.ndarray:
         return np.column_stack(self.terms(cells, weights)) @ np.array(astuple(self))
@@ -347,7 +360,12 @@ class PairEvidence(PairOdds):
         share = np.divide(same, explained, out=np.full(len(image), 0.5), where=explained > 0)
         fails, holds = (np.full(len(image), p) for p in (1 - weights.sum(), weights.sum()))
         prediction = explained * softened_logit(share)
-        return PairTerms(fails, fails * image, holds, holds * image, prediction, explained)
+        together = np.zeros(len(image))
+        if cells.bodies:
+            bodies = np.stack([of[row] for of, row in zip(cells.bodies, cells.predictions, strict=True)])
+            a, b = (bodies[:, cell] for cell in cells.pairs.T)
+            together = weights @ ((a == b) & (a > 0))
+        return PairTerms(fails, fails * image, holds, holds * image, prediction, explained, together)
 
 
 class _PairLabels(NamedTuple):

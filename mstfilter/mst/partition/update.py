@@ -33,6 +33,10 @@ anew from everything that was seen of it.
 
 At the first pause the candidates are the distinct samples, and every segment is a new object. So a hypothesis
 contains only objects that some frame has shown.
+
+The notes of the result contain all candidates as segmentations of the last frame with their weights
+(`mstfilter.scene.WeightedSegmentations`). A belief reads its probabilities there, rather than from the few hypotheses
+that resampling keeps.
 """
 
 from __future__ import annotations
@@ -53,6 +57,7 @@ from mstfilter.mst.completion import Completer, Completion, Extrude, arbitrate, 
 from mstfilter.mst.partition.association import Overlaps, recognised
 from mstfilter.mst.partition.candidates import Choices, largest
 from mstfilter.mst.partition.cells import Cells, PairEvidence, PairOdds, Readings
+from mstfilter.mst.partition.motions import common_motions
 from mstfilter.scene import (
     Clip,
     Evidence,
@@ -62,9 +67,12 @@ from mstfilter.scene import (
     ObjectRecord,
     ObjectView,
     Projection,
+    WeightedSegmentations,
     check_grids,
+    common_refinement,
     foreground,
     log_quality,
+    posed_camera,
     surface_agreement,
 )
 from mstfilter.smc import Candidates, Key, Population, Update, first_seen, key_of
@@ -176,6 +184,7 @@ class PartitionUpdate(Update):
             assert proposed is not None
             described, segments = _distinct(proposed, _segments(proposed, readings, raised))
             objects_of = partial(_new_objects, segments)
+            cells_of, partitions = _refined(segments)
         else:
             projected = self._project(predicted, observation)
             if proposed is None:
@@ -183,10 +192,16 @@ class PartitionUpdate(Update):
             predictions = self._predictions(predicted, projected, readings, observation.after)
             segments = _segments(proposed, readings, raised)
             weights = proposed.weights if np.ptp(proposed.log_weights) else None
-            cells = Cells.of(readings, segments, [one.objects for one in predictions], weights)
+            bodies = [common_motions(one.hypothesis) for one in predictions]
+            cells = Cells.of(readings, segments, [one.objects for one in predictions], weights, bodies)
             choices = self._choices(cells, predictions, projected.log_weights, mended)
             described = choices.described(projected)
             objects_of = partial(self._associate, cells, predictions, choices)
+            cells_of, partitions = cells.of_reading + 1, choices.partitions
+        seen = WeightedSegmentations(
+            readings.image(cells_of), partitions, described.weights, posed_camera(mended.after)
+        )
+        described = replace(described, notes={**described.notes, "segmentations": seen})
         key = key_of(rng)
 
         def build(candidate: int) -> Hypothesis:
@@ -365,6 +380,12 @@ def _distinct(proposed: Population, segments: Sequence[np.ndarray]) -> tuple[Pop
     example = np.unique(which, return_index=True)[1]
     merged = proposed.take(example, np.log(np.bincount(which, proposed.weights)))
     return merged, [segments[k] for k in example]
+
+
+def _refined(segments: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """The cell (m,) of each reading, 0 for none, and the segment (s, K) of each cell in each sample (m,)."""
+    found = common_refinement(segments)
+    return found.cells, found.objects[:, 1:]
 
 
 def _new_objects(segments: Sequence[np.ndarray], candidate: int) -> tuple[list[SceneObject], list[ObjectRecord]]:

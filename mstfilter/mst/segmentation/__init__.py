@@ -16,6 +16,10 @@ does all this and completes the segments to 3-D shapes.
 `regions`         measurements of regions and of their borders
 `learned_tree`    trees from learned log odds
 `border_network`  the trained network that corrects these log odds
+`divisions`       ways to divide a region, which a tree of borders may not contain
+`seam_measures`   what is measured of a division
+`seam_network`    the judge: one object, or two that touch?
+`seams`           the tree that contains both readings
 `cuts`            node values, the optimal cut, exact samples
 `mh`              Metropolis-Hastings samples
 `proposal`        which regions are objects; the proposal of the filter
@@ -30,7 +34,7 @@ __interfaces__ = {"boundary": "BoundaryModel", "tree": "TreeBuilder", "value": "
 __components__ = {
     "proposal": {"tree_cuts": "TreeCutProposal"},
     "boundary": {"colour_depth": "ColourDepthBoundary"},
-    "tree": {"learned": "LearnedTree", "ucm": "UcmTree", "border": "BorderTree"},
+    "tree": {"learned": "LearnedTree", "ucm": "UcmTree", "border": "BorderTree", "seams": "SeamTree"},
     "value": {"scenecut": "SceneCutObjectness", "merge_log_odds": "MergeLogOdds"},
     "sampler": {"mh": "MetropolisHastingsCuts", "exact": "ExactCuts", "optimal": "OptimalCut"},
 }

@@ -39,4 +39,5 @@ from mstfilter.mst.segmentation.regions import (
     SeenBorders as SeenBorders,
     connected_pixels as connected_pixels,
 )
+from mstfilter.mst.segmentation.seams import SeamTree as SeamTree
 from mstfilter.mst.segmentation.tree import Tree as Tree, TreeBuilder as TreeBuilder, UcmTree as UcmTree

@@ -310,10 +310,12 @@ class MergedTree(TreeBuilder):
         """Hash of the model. The hash is part of the keys of cached values."""
         return self.weights_key.encode()
 
-    def regions(self, boundary: np.ndarray, frame: Frame, pixels: np.ndarray) -> Regions:
-        """The leaves with their measurements. `pixels` (H, W) bool are the pixels of objects."""
+    def regions(
+        self, boundary: np.ndarray, frame: Frame, pixels: np.ndarray, seen: SeenBorders | None = None
+    ) -> Regions:
+        """The leaves with their measurements, from the pixels (H, W) bool of objects and the result of `look`."""
         leaves = object_leaves(self.leaves.build(boundary, frame).leaves, pixels)
-        return measure_regions(leaves, frame, boundary, self.look(frame))
+        return measure_regions(leaves, frame, boundary, self.look(frame) if seen is None else seen)
 
     def build(self, boundary: np.ndarray, frame: Frame | None = None, pixels: np.ndarray | None = None) -> Tree:
         """Build the tree of merged regions.
@@ -380,7 +382,7 @@ class BorderTree(MergedTree):
         check_weights(network.evidence, FEATURES, f"border model {self.weights!r}", f"{_FIT} --border FOLDER")
         return network.evidence, network.key
 
-    def look(self, frame: Frame) -> SeenBorders | None:
+    def look(self, frame: Frame) -> SeenBorders:
         return self._network().look(frame)
 
     def correction(self) -> PairNetwork | None:

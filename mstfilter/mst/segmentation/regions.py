@@ -62,7 +62,7 @@ REGION = _columns(_WIDTHS)
 BORDER = {
     name: k for k, name in enumerate(("length", "strength", "hollow", "convex", "step", "size", "clear", "seen"))
 }
-_SIGN = np.array([1, 1, 1, 1, -1, 1, 1, 1], dtype=np.float64)
+BORDER_SIGN = np.array([1, 1, 1, 1, -1, 1, 1, 1], dtype=np.float64)  #: of a border seen from its other side
 _MOST_LOG_ODDS = 6.0  # of a seen border
 
 
@@ -121,19 +121,31 @@ def measure_regions(
 
     Region 0 is the table and all other pixels without an object. See `object_leaves`.
     """
-    width = region.shape[1]
     n = int(region.max()) + 1
+    bend, maps, smooth = edge_maps(frame, boundary, seen)
+    sums = _region_sums(region, n, frame, bend, seen)
+    borders = _borders(region, n, maps, smooth)
+    sums[:, REGION["perimeter"].start] = [sum(row[0] for row in near.values()) for near in borders]
+    return Regions(region, sums, borders)
+
+
+def edge_maps(
+    frame: Frame, boundary: np.ndarray, seen: SeenBorders | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the rows of regions and borders are sums of.
+
+    The concave minus the convex curvature (H, W); the boundary strength, both curvatures and the log odds of a border
+    (H, W, 4); the smoothed disparity (H, W).
+    """
+    width = boundary.shape[1]
     D = filled_disparity(frame)
     hollow, convex = curvature(D, scaled_length(1, width))
-    sums = _region_sums(region, n, frame, hollow - convex, seen)
     smooth = cv2.GaussianBlur(D, (0, 0), max(0.7, scaled_length(1.5, width)))
     # The border that the network sees can be beside that of the leaves: the largest log odds in the surroundings.
     reach = 2 * max(1, round(scaled_length(2, width))) + 1
-    odds = np.zeros(region.shape, np.float32) if seen is None else seen.border
+    odds = np.zeros(boundary.shape, np.float32) if seen is None else seen.border
     odds = np.clip(cv2.dilate(odds, np.ones((reach, reach), np.uint8)), -_MOST_LOG_ODDS, _MOST_LOG_ODDS)
-    borders = _borders(region, n, np.stack([boundary, hollow, convex, odds], axis=-1), smooth)
-    sums[:, REGION["perimeter"].start] = [sum(row[0] for row in near.values()) for near in borders]
-    return Regions(region, sums, borders)
+    return hollow - convex, np.stack([boundary, hollow, convex, odds], axis=-1), smooth
 
 
 def _region_sums(region: np.ndarray, n: int, frame: Frame, bend: np.ndarray, seen: SeenBorders | None) -> np.ndarray:
@@ -141,17 +153,33 @@ def _region_sums(region: np.ndarray, n: int, frame: Frame, bend: np.ndarray, see
 
     `bend` (H, W) is the concave minus the convex curvature.
     """
-    height, width = region.shape
-    sums = np.zeros((n, sum(_WIDTHS.values())))
     at = np.nonzero(frame.valid & (region > 0))
     which = region[at]
+    terms, bins = pixel_terms(frame, bend, seen, at)
+    sums = np.zeros((n, sum(_WIDTHS.values())))
+    for k in np.flatnonzero(terms.any(axis=0)).tolist():
+        sums[:, k] = np.bincount(which, weights=terms[:, k], minlength=n)
+    sums[:, REGION["heights"]] = np.bincount(which * _BINS + bins, minlength=n * _BINS).reshape(n, _BINS)
+    return sums
+
+
+def pixel_terms(
+    frame: Frame, bend: np.ndarray, seen: SeenBorders | None, at: tuple[np.ndarray, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """What each of the k pixels `at` (rows, columns) adds to the sums of its region (columns `REGION`).
+
+    Returns the terms (k, C), in which heights and perimeter are 0, and the bins (k,) of the heights. All pixels have
+    readings. `bend` (H, W) is the concave minus the convex curvature.
+    """
+    height, width = bend.shape
+    found = np.zeros((len(at[0]), sum(_WIDTHS.values())))
 
     def put(name: str, *values: np.ndarray) -> None:
         for k, value in enumerate(values, start=REGION[name].start):
-            sums[:, k] = np.bincount(which, weights=value, minlength=n)
+            found[:, k] = value
 
     lab = cv2.cvtColor(frame.rgb.astype(np.float32) / 255, cv2.COLOR_RGB2Lab)[at]
-    put("pixels", np.ones(len(which)))
+    put("pixels", np.ones(len(lab)))
     put("lab", *lab.T)
     put("lab2", *(lab.T**2))
     u, v = (at[1] - width / 2) / (width / 4), (at[0] - height / 2) / (width / 4)
@@ -167,9 +195,7 @@ def _region_sums(region: np.ndarray, n: int, frame: Frame, bend: np.ndarray, see
     put("bend", bend[at])
     if seen is not None:
         put("centre", *seen.centre[at].T)
-    bins = np.clip(points[:, 2] / HEIGHT_BIN, 0, _BINS - 1).astype(np.int64)
-    sums[:, REGION["heights"]] = np.bincount(which * _BINS + bins, minlength=n * _BINS).reshape(n, _BINS)
-    return sums
+    return found, np.clip(points[:, 2] / HEIGHT_BIN, 0, _BINS - 1).astype(np.int64)
 
 
 def _borders(region: np.ndarray, n: int, maps: np.ndarray, disparity: np.ndarray) -> list[dict[int, np.ndarray]]:
@@ -177,30 +203,15 @@ def _borders(region: np.ndarray, n: int, maps: np.ndarray, disparity: np.ndarray
 
     `maps` (H, W, 4) has the boundary strength, the concave and the convex curvature, and the log odds of a border.
     """
-    reach = max(1, round(scaled_length(3, region.shape[1])))
     first, second, rows = [], [], []
     for axis in (0, 1):
         last = region.shape[axis] - 1
         pair_a, pair_b = np.take(region, np.arange(last), axis), np.take(region, np.arange(1, last + 1), axis)
         at = np.nonzero(pair_a != pair_b)
         i, j = pair_a[at], pair_b[at]
-        # Step of disparity, measured `reach` pixels away from the border on both sides, minus the change that the
-        # slopes on both sides predict over that distance.
-        far_a, near_a, near_b, far_b = (
-            _shifted(disparity, at, axis, shift) for shift in (-2 * reach, -reach, 1 + reach, 1 + 2 * reach)
-        )
-        slopes = (near_a - far_a) + (far_b - near_b)
-        raw = near_a - near_b
-        step = raw + slopes * ((2 * reach + 1) / (2 * reach))
-        step = np.where(np.sign(step) == np.sign(raw), np.sign(raw) * np.minimum(np.abs(step), np.abs(raw)), 0)
-        step = np.clip(step, -20, 20)
-        other = list(at)
-        other[axis] = at[axis] + 1
-        here, there = at, tuple(other)
-        edge, size = (maps[here] + maps[there]) / 2, np.abs(step)
-        row = np.column_stack([np.ones(len(i)), edge[:, :3], step, size, size > _CLEAR_STEP, edge[:, 3]])
+        row = border_terms(maps, disparity, axis, at)
         turned = i > j
-        row[turned] *= _SIGN
+        row[turned] *= BORDER_SIGN
         first.append(np.minimum(i, j))
         second.append(np.maximum(i, j))
         rows.append(row)
@@ -213,8 +224,30 @@ def _borders(region: np.ndarray, n: int, maps: np.ndarray, disparity: np.ndarray
     for k, pair in enumerate(pairs.tolist()):
         i, j = divmod(pair, n)
         borders[i][j] = table[k]
-        borders[j][i] = table[k] * _SIGN
+        borders[j][i] = table[k] * BORDER_SIGN
     return borders
+
+
+def border_terms(maps: np.ndarray, disparity: np.ndarray, axis: int, at: tuple[np.ndarray, ...]) -> np.ndarray:
+    """What each of k pairs of neighbouring pixels adds to the row of its border, (k, columns `BORDER`).
+
+    A pair is the pixel `at` (rows, columns) and the next one along the `axis`. `maps` as in `_borders`.
+    """
+    reach = max(1, round(scaled_length(3, disparity.shape[1])))
+    # Step of disparity, measured `reach` pixels away from the border on both sides, minus the change that the slopes
+    # on both sides predict over that distance.
+    far_a, near_a, near_b, far_b = (
+        _shifted(disparity, at, axis, shift) for shift in (-2 * reach, -reach, 1 + reach, 1 + 2 * reach)
+    )
+    slopes = (near_a - far_a) + (far_b - near_b)
+    raw = near_a - near_b
+    step = raw + slopes * ((2 * reach + 1) / (2 * reach))
+    step = np.where(np.sign(step) == np.sign(raw), np.sign(raw) * np.minimum(np.abs(step), np.abs(raw)), 0)
+    step = np.clip(step, -20, 20)
+    other = list(at)
+    other[axis] = at[axis] + 1
+    edge, size = (maps[at] + maps[tuple(other)]) / 2, np.abs(step)
+    return np.column_stack([np.ones(len(step)), edge[:, :3], step, size, size > _CLEAR_STEP, edge[:, 3]])
 
 
 def _shifted(image: np.ndarray, at: tuple[np.ndarray, ...], axis: int, shift: int) -> np.ndarray:

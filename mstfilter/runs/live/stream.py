@@ -298,10 +298,10 @@ class Stream:
 
     @property
     def belief(self) -> Belief:
-        """The weighted hypotheses at the last pause as a `Belief`."""
+        """The belief at the last pause: weighted hypotheses, and all weighted segmentations of its image."""
         if self.last is None or self.last.state.population is None:
             raise InputError("the stream has had no pause yet", "push frames until nothing moves, and call wait()")
-        return Belief(self.last.state.population)
+        return Belief.of_step(self.last.state, self.last.info)
 
     def wait(self) -> None:
         """Wait until all pushed frames are processed. Raises InputError in `on_pause`."""

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from mstfilter.base.errors import InputError, missing_library
-from mstfilter.base.files import locked, sweep, writing
+from mstfilter.base.files import cache_folder, locked, sweep, writing
 from mstfilter.base.lazy import progress_of
 from mstfilter.base.processes import available_cores, machine
 from mstfilter.base.reading import check_private
@@ -92,8 +92,6 @@ def run_study(
     InputError
         If the study or the folder is invalid, before any run starts. Failed runs do not raise an error.
     """
-    from mstfilter.lab.simulation import cache_folder
-
     plan = make_plan(study, overrides)
     cache = (cache or cache_folder()).absolute()
     with _locked(path) as folder, progress_of(progress, bars="study_bars") as report, _backend(cluster):

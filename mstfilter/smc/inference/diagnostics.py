@@ -6,7 +6,8 @@ Whiteley 2018).
 
 >>> from mstfilter.smc import Normal, StateSpaceModel, bootstrap, run_variance
 >>> model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 1.0))
->>> found = run_variance(bootstrap(model, n=1000), [0.3, -0.1, 0.8], seed=0, lag=20)
+>>> states, ys = model.simulate(50, seed=1)
+>>> found = run_variance(bootstrap(model, n=1000), ys, seed=0, lag=20)
 >>> estimate, standard_error = found.log_evidence[-1], found.log_evidence_variance[-1] ** 0.5
 
 `energy_distance` compares two populations. Half of the energy distance between a population and the true state is

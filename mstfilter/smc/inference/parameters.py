@@ -3,13 +3,17 @@
 The posterior of parameters is p(theta) p(y | theta) up to a factor. A filter estimates the evidence p(y | theta)
 without bias, and an unbiased estimate in place of the exact value leaves the posterior of a Metropolis chain exact,
 if the estimate of the present parameters is kept until a proposal is accepted (Andrieu, Doucet, Holenstein 2010). So
-a model with parameters is a function that returns a filter:
+a model with parameters is a function that returns a filter, and the prior is a distribution for each parameter:
 
 >>> def filter_of(theta):
-...     rho, sigma = theta
-...     return bootstrap(StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(rho * x, sigma), observation), n=200)
->>> chains = pmmh(filter_of, observations, log_prior, start=[0.5, 1.0], scale=[0.1, 0.1], n_iterations=5000)
->>> chains.theta[1000:].mean(axis=(0, 1)), chains.autocorrelation_times()
+...     move = lambda x: Normal(theta["rho"] * x, theta["sigma"])
+...     return bootstrap(StateSpaceModel.of(Normal(0.0, 1.0), move, observation), n=200)
+>>> prior = {"rho": Uniform(-1.0, 1.0), "sigma": Gamma(2.0, 0.5)}
+>>> chains = pmmh(filter_of, observations, prior, scale={"rho": 0.1, "sigma": 0.1}, n_iterations=5000)
+>>> chains["rho"][1000:].mean(), chains.autocorrelation_times()
+
+Without names, parameters are an array (d,): then the prior is a distribution of vectors, or a function that returns
+the log density, and `start` and `scale` are arrays.
 
 - `pmmh` is such a Metropolis chain.
 - `ensemble` runs the ensemble sampler emcee with the same estimates. It needs no scale of the steps.
@@ -32,12 +36,15 @@ import numpy as np
 from mstfilter.base.errors import InputError, LostRunError, check_integer
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.first_steps import unexamined
-from mstfilter.smc.history import flat_columns, log_evidence
+from mstfilter.smc.history import log_evidence
 from mstfilter.smc.inference.conditional import conditional_path
 from mstfilter.smc.inference.metropolis import metropolis
 from mstfilter.smc.inputs import check_observations, split_input
+from mstfilter.smc.interfaces import Distribution
+from mstfilter.smc.models.distributions import Joint, as_distribution
 from mstfilter.smc.population import Particles, union
 from mstfilter.smc.streams import Key
+from mstfilter.smc.summaries import data_frame, flat_columns, inference_data
 from mstfilter.smc.sweep import can_sweep, sweep_runs
 
 FilterOf = Callable[[np.ndarray], ParticleFilter]
@@ -53,18 +60,46 @@ class Chains:
     log_density: np.ndarray  #: (n_iterations, n_chains) log prior plus `log_evidence`
     accepted: np.ndarray  #: (n_chains,) share of accepted proposals
     paths: tuple[Particles, ...] = ()  #: of `particle_gibbs`: the path of states after each iteration
+    names: tuple[str, ...] = ()  #: of the d parameters; () if they have none
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """(n_iterations, n_chains) values of the parameter with a name."""
+        if name not in self.names:
+            raise KeyError(
+                f"there is no parameter {name!r}; there are: {', '.join(self.names) or 'none with a name'}"
+            )
+        return self.theta[..., self.names.index(name)]
 
     def __repr__(self) -> str:
         n_iterations, n_chains, d = self.theta.shape
-        size = f"{n_iterations} iterations of {n_chains} chains, {d} parameters"
+        size = f"{n_iterations} iterations of {n_chains} chains, {', '.join(self.names) or f'{d} parameters'}"
         return f"Chains: {size}, accepted {self.accepted.min():.2f} to {self.accepted.max():.2f}"
 
     def columns(self) -> dict[str, np.ndarray]:
         """Columns of a table: chain, draw, parameters, log evidence and log density. Rows are sorted by chain."""
         numbers = np.indices(self.log_density.shape)
-        arrays = {"chain": numbers[1], "draw": numbers[0], "theta": self.theta}
+        arrays = {"chain": numbers[1], "draw": numbers[0], **self._parameters()}
         arrays |= {"log_evidence": self.log_evidence, "log_density": self.log_density}
         return flat_columns({name: np.swapaxes(a, 0, 1) for name, a in arrays.items()}, axes=2)
+
+    def _parameters(self) -> dict[str, np.ndarray]:
+        return {name: self[name] for name in self.names} if self.names else {"theta": self.theta}
+
+    def to_pandas(self) -> Any:
+        """A ``pandas.DataFrame`` of `columns`; MissingLibraryError if pandas is not installed."""
+        return data_frame(self.columns())
+
+    def to_arviz(self, discard: int = 0) -> Any:
+        """ArviZ's container of the draws without the first `discard` iterations.
+
+        ``sample_stats`` holds the log density (``lp``) and the log evidence.
+        """
+        stats = {"lp": self.log_density, "log_evidence": self.log_evidence}
+        posterior, stats = (
+            {name: np.swapaxes(a[discard:], 0, 1) for name, a in group.items()}
+            for group in (self._parameters(), stats)
+        )
+        return inference_data(posterior, stats)
 
     def autocorrelation_times(self, discard: int = 0) -> np.ndarray:
         """(d,) integrated autocorrelation times in iterations, without the first `discard` iterations.
@@ -85,20 +120,82 @@ class Chains:
 _N_STARTS = 20
 
 
+class _Parameters:
+    """Log prior, names and forms of parameters, which are vectors (d,) inside of the chains."""
+
+    def __init__(self, prior: Any, start: Any) -> None:
+        self.names: tuple[str, ...] = ()
+        self.prior: Distribution | None = None
+        if not callable(prior):
+            self.prior = as_distribution(prior)
+            self.names = tuple(self.prior.parts) if isinstance(self.prior, Joint) else ()
+            prior = self.prior.log_prob
+        if isinstance(start, Mapping) and self.prior is None:
+            self.names = tuple(map(str, start))
+        self.function = prior
+
+    def log_prior(self, theta: np.ndarray) -> float:
+        """Log prior density of a vector (d,)."""
+        found = np.asarray(self.function(self.form(theta)), np.float64)
+        if found.size != 1:
+            raise InputError(f"the log prior has shape {found.shape}, expected one number")
+        return found.item()
+
+    def form(self, theta: np.ndarray) -> Any:
+        """What `filter_of` and the prior get: a mapping from names to entries of ``theta``, or the array itself."""
+        return dict(zip(self.names, theta, strict=True)) if self.names else theta
+
+    def start(self, given: Any, n: int | None, rng: np.random.Generator) -> np.ndarray:
+        """(R, d) first parameters. Without any, `n` draws from the prior; None stands for 4 d."""
+        if given is not None:
+            return np.atleast_2d(self.vector("start", given))
+        if self.prior is None:
+            raise InputError("start is missing", "only a prior that is a distribution can be drawn from")
+        if n is None:
+            n = 4 * np.shape(self.vector("the prior", self.prior.sample(rng, 1)))[-1]
+        drawn = self.vector("the prior", self.prior.sample(rng, n))
+        return drawn if drawn.ndim == 2 else drawn[:, None]
+
+    def vector(self, what: str, given: Any) -> np.ndarray:
+        """Numbers (..., d), from an array, or from a mapping from the names to numbers or arrays (...)."""
+        if not isinstance(given, Mapping) or not self.names:
+            return _numbers(what, given)
+        if set(given) != set(self.names):
+            raise InputError(f"{what} has the names {sorted(map(str, given))}, expected {sorted(self.names)}")
+        try:
+            columns = np.broadcast_arrays(*(_numbers(f"{what} of {name}", given[name]) for name in self.names))
+        except ValueError as error:
+            shapes = {name: np.shape(given[name]) for name in self.names}
+            raise InputError(f"{what} has arrays of different lengths: {shapes}") from error
+        if columns[0].ndim > 1:
+            raise InputError(
+                f"{what} of {self.names[0]} has shape {columns[0].shape}, expected one number per chain",
+                "give each entry of a vector a name of its own, or all parameters as an array without names",
+            )
+        return np.stack(columns, axis=-1)
+
+
 @dataclass
 class _Posterior:
     """Log prior and estimated log evidence of several parameter vectors, one per row."""
 
-    filter_of: FilterOf
+    given_filter_of: Callable[[Any], ParticleFilter]
     observations: list[Any]
-    log_prior: Callable[[np.ndarray], float]
+    parameters: _Parameters
     batched: bool = False
     n_runs: int = 0  #: so far: the model is examined once
+
+    def filter_of(self, theta: np.ndarray) -> ParticleFilter:
+        """The filter of parameters (d,), or (d, m) for a batch."""
+        return self.given_filter_of(self.parameters.form(theta))
+
+    def log_prior(self, theta: np.ndarray) -> float:
+        return self.parameters.log_prior(theta)
 
     def __call__(self, rng: np.random.Generator, theta: np.ndarray) -> dict[str, np.ndarray]:
         """Mapping with the given ``theta`` (R, d), ``log_density`` (R,) and ``log_evidence`` (R,)."""
         seeds = rng.integers(2**63, size=len(theta))
-        log_prior = np.array([float(self.log_prior(row)) for row in theta])
+        log_prior = np.array([self.log_prior(row) for row in theta])
         if np.isnan(log_prior).any():
             raise InputError(f"the log prior of {theta[np.isnan(log_prior)][0].tolist()} is NaN")
         evidence, possible = np.full(len(theta), -np.inf), log_prior > -np.inf
@@ -164,14 +261,15 @@ class _Posterior:
 
 
 def pmmh(
-    filter_of: FilterOf,
+    filter_of: Callable[[Any], ParticleFilter],
     observations: Sequence[Any],
-    log_prior: Callable[[np.ndarray], float],
-    start: Any,
-    scale: Any,
-    n_iterations: int,
+    prior: Any,
+    start: Any = None,
+    scale: Any = None,
+    n_iterations: int = 1000,
     seed: int = 0,
     *,
+    n_chains: int = 1,
     batched: bool = False,
 ) -> Chains:
     """Particle marginal Metropolis-Hastings: a random walk on the parameters.
@@ -182,15 +280,18 @@ def pmmh(
     Parameters
     ----------
     filter_of : callable
-        ``(theta) -> ParticleFilter`` for parameters (d,). The components of the filter must be properly weighted.
-    log_prior : callable
-        ``(theta) -> float``: the log prior density; -inf outside of the support.
-    start : (d,) or (R, d) array_like
-        First parameters of one chain or of R chains, in the order in which `filter_of` takes them.
-    scale : (d,) or (d, d) array_like
+        ``(theta) -> ParticleFilter``. The components of the filter must be properly weighted. If the parameters have
+        names, ``theta`` is a mapping from names to numbers, otherwise an array (d,).
+    prior : mapping, Distribution or callable
+        A distribution for each name; a joint distribution, such as `Product`, `MultivariateNormal` or one of
+        scipy.stats; or a function ``(theta) -> float``, the log density, -inf outside of the support.
+    start : mapping, (d,) or (R, d) array_like, optional
+        First parameters of one chain or of R chains: numbers or arrays (R,) by name, or an array in the order in
+        which `filter_of` takes them. By default, `n_chains` chains start at draws from the prior.
+    scale : mapping, (d,) or (d, d) array_like
         Standard deviations or covariance of a step. A good choice is 2.4 / sqrt(d) posterior standard deviations.
     batched : bool
-        Whether ``filter_of`` also accepts parameters (d, m), one column for each of the m particles of all chains.
+        Whether ``filter_of`` also accepts parameters (d, m), or arrays (m,) by name, one for each of the m particles.
         The filters of all chains then run as one batch. To combine a parameter with particles (n, k), use
         ``theta[0][..., None]``. If a component looks at several particles, the filters run one by one, with a
         warning.
@@ -200,13 +301,16 @@ def pmmh(
     InputError
         If the prior is zero at the start of a chain, or if 20 estimates of the evidence at the start are zero.
     """
-    theta = np.atleast_2d(_numbers("start", start))
+    parameters, key = _Parameters(prior, start), Key(seed).child("pmmh")
+    check_integer("n_chains", n_chains)
+    theta = parameters.start(start, n_chains, key.child("prior").generator())
     if theta.ndim > 2:
         raise InputError(f"start has shape {theta.shape}, expected (d,) or (chains, d)")
-    root = _step_root(scale, theta.shape[1])
+    if scale is None:
+        raise InputError("scale is missing", "give the standard deviation of a step for each parameter")
+    root = _step_root(parameters.vector("scale", scale), theta.shape[1])
     check_integer("n_iterations", n_iterations)
-    posterior = _Posterior(filter_of, list(check_observations(observations)), log_prior, batched)
-    key = Key(seed).child("pmmh")
+    posterior = _Posterior(filter_of, list(check_observations(observations)), parameters, batched)
 
     def propose(rng: np.random.Generator, now: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
         new = posterior(rng, now["theta"] + rng.standard_normal(theta.shape) @ root.T)
@@ -217,7 +321,8 @@ def pmmh(
         [(state, accepted)] = metropolis(key.child(i).generator(), state, propose)
         steps.append({**state, "accepted": accepted})
     found = {name: np.stack([step[name] for step in steps]) for name in steps[0]}
-    return Chains(found["theta"], found["log_evidence"], found["log_density"], found["accepted"].mean(axis=0))
+    accepted = found["accepted"].mean(axis=0)
+    return Chains(found["theta"], found["log_evidence"], found["log_density"], accepted, names=parameters.names)
 
 
 def _start(posterior: _Posterior, key: Key, theta: np.ndarray) -> dict[str, np.ndarray]:
@@ -246,7 +351,7 @@ def _numbers(name: str, value: Any) -> np.ndarray:
         raise InputError(
             f"{name} is a mapping with the keys {', '.join(map(str, value))}, expected an array of numbers",
             f"parameters have an order and no names: {name}={[*value.values()]}",
-            f"name them where they are used: {', '.join(map(str, value))} = theta",
+            "a prior with names gives them names: prior={'rho': Uniform(-1.0, 1.0), ...}",
         )
     try:
         numbers = np.array(value, np.float64)
@@ -273,13 +378,14 @@ def _step_root(scale: Any, d: int) -> np.ndarray:
 
 
 def ensemble(
-    filter_of: FilterOf,
+    filter_of: Callable[[Any], ParticleFilter],
     observations: Sequence[Any],
-    log_prior: Callable[[np.ndarray], float],
-    start: Any,
-    n_iterations: int,
+    prior: Any,
+    start: Any = None,
+    n_iterations: int = 1000,
     seed: int = 0,
     *,
+    n_walkers: int | None = None,
     batched: bool = False,
 ) -> Chains:
     """Ensemble MCMC (Goodman and Weare 2010) by emcee, with the estimated evidence as the likelihood.
@@ -289,19 +395,21 @@ def ensemble(
 
     Parameters
     ----------
-    filter_of, observations, log_prior, batched
+    filter_of, observations, prior, batched
         As in `pmmh`. If `batched` is True, the filters of half of the walkers run as one batch.
-    start : (n_walkers, d) array_like
-        First parameters of the walkers. At least 2 d walkers are needed, with different parameters.
+    start : mapping of (n_walkers,) arrays or (n_walkers, d) array_like, optional
+        First parameters of the walkers. At least 2 d walkers are needed, with different parameters. By default,
+        `n_walkers` (or 4 d) walkers start at draws from the prior.
     """
     import emcee
 
-    theta = _numbers("start", start)
+    parameters, key = _Parameters(prior, start), Key(seed).child("ensemble")
+    theta = parameters.start(start, n_walkers, key.child("prior").generator())
     if theta.ndim != 2 or len(theta) < 2 * theta.shape[1]:
         raise InputError(f"start has shape {theta.shape}, expected (walkers, d) with at least 2 d walkers")
     check_integer("n_iterations", n_iterations)
-    posterior = _Posterior(filter_of, list(check_observations(observations)), log_prior, batched)
-    rng = Key(seed).child("ensemble").generator()
+    posterior = _Posterior(filter_of, list(check_observations(observations)), parameters, batched)
+    rng = key.generator()
 
     def log_density(thetas: np.ndarray) -> np.ndarray:
         found = posterior(rng, thetas)
@@ -311,7 +419,8 @@ def ensemble(
     own = np.random.RandomState(np.random.MT19937(rng.integers(2**63)))  # emcee draws from the legacy generator
     sampler.run_mcmc(emcee.State(theta, random_state=own.get_state()), n_iterations)
     evidence = sampler.get_blobs().reshape(n_iterations, len(theta))
-    return Chains(sampler.get_chain(), evidence, sampler.get_log_prob(), sampler.acceptance_fraction)
+    accepted = sampler.acceptance_fraction
+    return Chains(sampler.get_chain(), evidence, sampler.get_log_prob(), accepted, names=parameters.names)
 
 
 def particle_gibbs(

@@ -17,9 +17,10 @@ A parameter that is one number is checked when the distribution is made. Rows ar
 log density of a row that is out of range is NaN: an update refuses it, and a Metropolis move, which may propose such
 parameters, rejects it.
 
-Frozen distributions of scipy.stats, such as ``stats.poisson(rate)`` and ``stats.gamma(shape)``, can be used in place
-of the classes of this module (`as_distribution`), which are three to six times as fast. For a distribution of another
-library, write a `Distribution` whose `sample` draws from the given generator.
+More families are in `mstfilter.smc.models.families`, and mixtures, truncated distributions and products in
+`mstfilter.smc.models.combined`. Frozen distributions of scipy.stats, such as ``stats.cauchy(x)``, can be used in
+their place (`as_distribution`), but are slower. For a distribution of another library, write a `Distribution` whose
+`sample` draws from the given generator.
 """
 
 from __future__ import annotations

@@ -7,8 +7,9 @@ is from the truth:
 >>> import numpy as np
 >>> from mstfilter.smc import bootstrap, kalman_filter, linear_gaussian
 >>> model = {"F": [[0.9]], "Q": [[0.25]], "H": [[1.0]], "R": [[1.0]], "m0": [0.0], "P0": [[1.0]]}
->>> exact = kalman_filter(**model, observations=[0.3, -0.1, 0.8])
->>> state, _ = bootstrap(linear_gaussian(**model), n=10_000).run([0.3, -0.1, 0.8], seed=0)
+>>> states, ys = linear_gaussian(**model).simulate(20, seed=1)
+>>> exact = kalman_filter(**model, observations=ys)
+>>> state, _ = bootstrap(linear_gaussian(**model), n=10_000).run(ys, seed=0)
 >>> bool(abs(state.log_evidence - exact.log_evidence[-1]) < 0.05)
 True
 
@@ -28,6 +29,8 @@ import numpy as np
 
 from mstfilter.base.errors import InputError
 from mstfilter.smc.inputs import AtStep, check_observations, missing_input, split_input
+from mstfilter.smc.interfaces import Distribution
+from mstfilter.smc.models.distributions import as_distribution
 from mstfilter.smc.models.gaussian import entry, nonlinear_gaussian, vector_of
 from mstfilter.smc.models.state_space import StateSpaceModel
 
@@ -187,12 +190,22 @@ def _triangular(blocks: list[list[np.ndarray]]) -> np.ndarray:
     return upper.T
 
 
-def hidden_markov(initial: Any, transition: Any, log_likelihood: Callable[..., Any]) -> StateSpaceModel:
+def hidden_markov(initial: Any, transition: Any, emission: Any) -> StateSpaceModel:
     """A hidden Markov model with K states. Particles are (n,) int from 0 to K - 1.
 
-    `initial` (K,) holds the probabilities of x_0. Row i of `transition` (K, K) holds the probabilities of x_t given
-    x_{t-1} = i. ``log_likelihood(y)`` (K,) returns log p(y_t | x_t) for each state; -inf if the state cannot produce
-    y_t. The function may also have the parameters ``t`` and ``u``. `forward_backward` computes the exact posteriors.
+    Parameters
+    ----------
+    initial : (K,) array_like
+        Probabilities of x_0.
+    transition : (K, K) array_like
+        Row i holds the probabilities of x_t given x_{t-1} = i.
+    emission : Distribution or callable
+        The distribution of y_t, with one row for each state: ``Normal([0.0, 3.0], 1.0)``, or ``Categorical(p)`` with
+        the probabilities (K, m) of m symbols. Or a function ``log_likelihood(y)`` (K,) that returns log p(y_t | x_t)
+        for each state, -inf if the state cannot produce y_t; it may also have the parameters ``t`` and ``u``. Only
+        a distribution can be simulated.
+
+    `forward_backward` computes the exact posteriors.
     """
     start, moves = _chain(initial, transition)
     # The last positive entry is 1 exactly, so that u < 1 never selects a state of probability 0.
@@ -202,12 +215,14 @@ def hidden_markov(initial: Any, transition: Any, log_likelihood: Callable[..., A
     with np.errstate(divide="ignore"):
         log_start, log_moves = np.log(start), np.log(moves)
 
+    states = _States.of(emission, len(start))
     return StateSpaceModel(
         lambda rng, n: (below_start <= rng.random(n)[:, None]).sum(axis=-1),
         lambda rng, x: (below[x] <= rng.random(len(x))[:, None]).sum(axis=-1),
-        _States(log_likelihood, len(start)).of_particles,
+        states.of_particles,
         lambda x: log_start[x],
         lambda old, new: log_moves[old, new],
+        None if states.emission is None else states.sample_observation,
     )
 
 
@@ -235,9 +250,7 @@ class Marginals(NamedTuple):
     log_evidence: np.ndarray  #: (T,) log p(y_0 .. y_t)
 
 
-def forward_backward(
-    initial: Any, transition: Any, log_likelihood: Callable[..., Any], observations: Iterable[Any]
-) -> Marginals:
+def forward_backward(initial: Any, transition: Any, emission: Any, observations: Iterable[Any]) -> Marginals:
     """The forward-backward algorithm (Rabiner 1989), with the arguments of `hidden_markov`.
 
     Raises InputError if a shape does not fit, or if an observation has probability 0.
@@ -247,7 +260,7 @@ def forward_backward(
     with np.errstate(divide="ignore"):
         start, moves = map(np.log, _chain(initial, transition))
     ys = [split_input(y) for y in check_observations(observations)]
-    T, K, states = len(ys), len(start), _States(log_likelihood, len(start))
+    T, K, states = len(ys), len(start), _States.of(emission, len(start))
     log_filtered, seen, total = np.empty((T, K)), np.zeros((T, K)), np.zeros(T)
     for t, (y, u) in enumerate(ys):
         total[t] = total[t - 1] if t else 0.0
@@ -268,11 +281,29 @@ def forward_backward(
 
 @dataclass(frozen=True)
 class _States(AtStep):
-    """The log likelihoods of K states."""
+    """The log likelihoods of K states, and the distribution of observations if it is known."""
 
     log_likelihood: Callable[..., Any]
     K: int
+    emission: Distribution | None = None
     step_functions: ClassVar = {"log_likelihood": 1}
+
+    @classmethod
+    def of(cls, emission: Any, K: int) -> _States:
+        """From a function, or from a distribution with K rows."""
+        if callable(emission):
+            return cls(emission, K)
+        given = as_distribution(emission)
+        if given.parameter_shape[:1] != (K,):
+            raise InputError(
+                f"emission has parameters of shape {given.parameter_shape}, expected one row per state: {K}"
+            )
+        return cls(given.log_prob, K, given)
+
+    def sample_observation(self, rng: np.random.Generator, x: np.ndarray) -> np.ndarray:
+        """(n, ...) an observation of each particle: of draws for all states, that of its own."""
+        assert self.emission is not None
+        return np.stack([self.emission.sample(rng, self.K)[k] for k in x])
 
     def of_all(self, y: Any) -> np.ndarray:
         """(K,) log p(y | x) of each state."""

@@ -23,7 +23,7 @@ References: van der Merwe, Doucet, de Freitas, Wan (2000); Doucet, de Freitas, M
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -34,8 +34,9 @@ from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.inputs import AtStep
 from mstfilter.smc.interfaces import Proposal, Transition, Update
 from mstfilter.smc.models.distributions import MultivariateNormal
+from mstfilter.smc.models.simulation import simulate_steps
 from mstfilter.smc.models.state_space import StateSpaceModel
-from mstfilter.smc.population import Population, union
+from mstfilter.smc.population import Particles, Population, union
 
 
 def nonlinear_gaussian(
@@ -220,6 +221,22 @@ class ConditionallyLinear(AtStep):
     cov: Any
 
     step_functions: ClassVar = {"sample_initial": 2, "sample_transition": 2, "linear": 1}
+
+    def simulate(self, n_steps: int, seed: int = 0, inputs: Iterable[Any] | None = None) -> tuple[Particles, Any]:
+        """Draw u_t (T, ...) and z_t (T, d), as a mapping, and y_t (T, k), as `StateSpaceModel.simulate` does."""
+
+        def step(rng: np.random.Generator, t: int, u: Any, x: Any) -> tuple[Any, Any]:
+            at, mean = self.at_step(t, u), np.asarray(self.mean, np.float64)
+            regimes = at.sample_initial(rng, 2) if x is None else at.sample_transition(rng, x["u"])
+            given = _checked(at.linear(regimes), np.tile(mean, (2, 1)))
+            F, Q, H, R = (a if a.ndim == 2 else a[0] for a in given[:4])
+            if x is None:
+                z = rng.multivariate_normal(mean, self.cov)
+            else:
+                z = rng.multivariate_normal(F @ x["z"][0] + np.broadcast_to(given.b, (2, len(mean)))[0], Q)
+            return {"u": regimes, "z": np.stack([z, z])}, rng.multivariate_normal(H @ z, R)
+
+        return simulate_steps(step, n_steps, seed, inputs)
 
 
 @dataclass(frozen=True)

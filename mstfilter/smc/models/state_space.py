@@ -8,6 +8,7 @@ state, y_t ~ p(y_t | x_t). Three distributions are a model:
 ...     transition=lambda x: Normal(0.9 * x, 0.5),
 ...     observation=lambda x: Normal(x, 1.0),
 ... )
+>>> states, observations = model.simulate(100, seed=1)
 >>> state, infos = bootstrap(model, n=1000).run(observations, seed=0)           # Gordon, Salmond, Smith 1993
 
 The bootstrap filter moves particles by f, and so without regard to y_t. If the likelihood is narrow, few of them
@@ -25,7 +26,7 @@ Papaspiliopoulos (2020), chapter 10.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -59,6 +60,7 @@ from mstfilter.smc.interfaces import (
     Trigger,
 )
 from mstfilter.smc.models.distributions import Joint, as_distribution
+from mstfilter.smc.models.simulation import first_row, simulate_steps
 from mstfilter.smc.population import Particles, Population, count_particles, take
 from mstfilter.smc.resampling import Systematic
 
@@ -84,7 +86,7 @@ class StateSpaceModel(AtStep):
     log_transition : callable, optional
         ``(previous, new) -> (n,)`` log f(x_t | x_{t-1}) of paired rows, for guided filters and moves.
     sample_observation : callable, optional
-        ``(rng, particles) -> (n, ...)`` draws y_t given x_t, to make data.
+        ``(rng, particles) -> (n, ...)`` draws y_t given x_t, for `simulate`.
     """
 
     sample_initial: Callable[[np.random.Generator, int], Any]
@@ -131,6 +133,42 @@ class StateSpaceModel(AtStep):
             model.log_transition,
             model.sample_observation,
         )
+
+    def simulate(self, n_steps: int, seed: int = 0, inputs: Iterable[Any] | None = None) -> tuple[Particles, Any]:
+        """Draw states x_0 .. x_{T-1} and observations y_0 .. y_{T-1} from the model.
+
+        Parameters
+        ----------
+        n_steps : int
+            Number of steps T.
+        seed : int
+        inputs : iterable of length T, optional
+            The input of each step, for functions with a parameter ``u``.
+
+        Returns
+        -------
+        states : (T, ...) array, mapping of arrays (T, ...), or tuple of T objects
+            As the particles of the model.
+        observations : (T, ...) array or list of T observations
+            What a filter takes: with inputs, a list of `WithInput`.
+
+        Raises
+        ------
+        InputError
+            If the model has no `sample_observation`.
+        """
+
+        def step(rng: np.random.Generator, t: int, u: Any, x: Any) -> tuple[Any, Any]:
+            at = self.at_step(t, u)
+            if at.sample_observation is None:
+                raise InputError(
+                    "the model has no sample_observation to draw observations",
+                    "give StateSpaceModel a function sample_observation(rng, particles), or use .of()",
+                )
+            x = at.sample_initial(rng, 2) if x is None else at.sample_transition(rng, x)
+            return x, first_row(at.sample_observation(rng, x))
+
+        return simulate_steps(step, n_steps, seed, inputs)
 
     def density(self, which: str) -> Callable[..., np.ndarray]:
         """The function ``log_initial`` or ``log_transition``.

@@ -41,7 +41,6 @@ from mstfilter.smc.first_steps import Few, compare_alone, is_numeric, recorded, 
 from mstfilter.smc.inputs import split_input
 from mstfilter.smc.models.programs.examination import examine_program
 from mstfilter.smc.models.programs.filters import ProgramInitial, ProgramTransition, program_step, run_once
-from mstfilter.smc.models.programs.handlers import SimulateHandler
 from mstfilter.smc.population import Particles, count_particles, take
 from mstfilter.smc.testing.contract import FALSE_ALARM, prerequisite, same, seeded, statistical
 from mstfilter.smc.testing.exact import ExactContract, check_same_law
@@ -52,8 +51,8 @@ _STEPS, _PARTICLES, _SEED = 20, 200, 1
 class ModelContract(ExactContract):
     """The contract of a `StateSpaceModel`, a `Program`, the function of a program, or a filter made of one of them.
 
-    `observations` are the observations of a run. Without them, they are drawn from the model, which needs
-    `StateSpaceModel.of`, a field `sample_observation`, or a program with one `observe`.
+    `observations` are the observations of a run. Without them, they are drawn from the model by its
+    method `simulate`.
     """
 
     observations: ClassVar[Sequence[Any] | None] = None
@@ -276,31 +275,15 @@ def _check_integral(w: np.ndarray, fault: str) -> None:
 
 
 def simulated(filter: ParticleFilter, n_steps: int, seed: int = 0) -> list[Any]:
-    """Observations drawn from the model of a filter: those of the first of two particles."""
-    rng, previous, ys = seeded(seed), None, []
-    hint = "give observations (mstfilter check ./model.py:model --observations ./model.py:ys)"
-    for t in range(n_steps):
-        at = filter.at_step(t, None)
-        component: Any = at.initial if previous is None else at.transition
-        if isinstance(component, ProgramInitial | ProgramTransition):
-            handler = SimulateHandler(rng)
-            try:
-                run = run_once(component.model, handler, previous, None, 2)
-            except Exception as error:
-                raise InputError(f"the program cannot be simulated: {hint}; {error}") from error
-            if len(handler.observed) != 1:
-                names = sorted(handler.observed) or "nothing"
-                raise InputError(f"the program observes {names} if it is simulated, expected one name: {hint}")
-            previous = {**run.values, **run.returned}
-            (y, *_) = next(iter(handler.observed.values()))
-        else:
-            model = component.model
-            if model.sample_observation is None:
-                raise InputError(f"the model has no sample_observation to draw observations: {hint}")
-            previous = model.sample_initial(rng, 2) if t == 0 else model.sample_transition(rng, previous)
-            y = np.asarray(model.sample_observation(rng, previous))[0]
-        ys.append(y.item() if np.ndim(y) == 0 else y)
-    return ys
+    """Observations drawn from the model of a filter."""
+    initial: Any = filter.initial
+    model = Program(initial.model) if isinstance(initial, ProgramInitial) else initial.model
+    try:
+        return [y.item() if np.ndim(y) == 0 else y for y in model.simulate(n_steps, seed)[1]]
+    except Exception as error:
+        what = error.message if isinstance(error, InputError) else f"the model cannot be simulated ({error})"
+        hint = "give observations (mstfilter check ./model.py:model --observations ./model.py:ys)"
+        raise InputError(f"{what}: {hint}") from error
 
 
 def _groups(particles: Particles) -> list[Few]:

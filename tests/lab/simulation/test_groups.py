@@ -20,10 +20,10 @@ TINY = {"width": 160, "height": 120, "n_actions": 2, "frames_per_clip": 6, "fps"
 def test_the_share_of_one_is_the_parameter(kind):
     for share in (0.0, 0.3, 1.0):
         family = replace(scene_family(kind), one_share=share)
-        n = 150 if share == 0.3 and kind == "row" else 12
+        n = 60 if share == 0.3 and kind == "row" else 12
         one = [draw_group(np.random.default_rng(k), family, ANY).one for k in range(n)]
-        # Five standard deviations of a share of 150.
-        assert np.mean(one) == pytest.approx(share, abs=0.19 if n == 150 else (0.7 if share == 0.3 else 0.0))
+        # Five standard deviations of a share of 60.
+        assert np.mean(one) == pytest.approx(share, abs=0.3 if n == 60 else (0.7 if share == 0.3 else 0.0))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -60,10 +60,15 @@ def test_parts_of_one_body_stay_in_place_when_it_moves():
     np.testing.assert_allclose(*distance, atol=1e-9)
 
 
-@pytest.mark.parametrize("aim", PUSH_AIMS)
-def test_pushes_do_what_their_aim_says(aim):
+@pytest.mark.parametrize(
+    ("aim", "seeds"),
+    [("nothing", [0]), ("apart", [0]), ("together", [1])]
+    + [pytest.param(aim, [0, 1, 2], marks=pytest.mark.nightly) for aim in PUSH_AIMS],
+)
+def test_pushes_do_what_their_aim_says(aim, seeds):
+    """In two of three scenes; the fast tests have a scene in which the aim is reached."""
     reached = 0
-    for seed in range(3):
+    for seed in seeds:
         family = replace(scene_family("row"), one_share=0.0, push_aims=aim, n_candidates=12)
         scene = SimulatedScene(replace(family, **TINY), seed)
         before = [group.part_poses(scene.world.poses())[1] for group in scene.objects.groups]
@@ -80,7 +85,7 @@ def test_pushes_do_what_their_aim_says(aim):
             "apart": max(change) > 0.01,
             "together": any(m.min() > 0.02 and c < 0.004 for m, c in zip(moved, change, strict=True)),
         }[aim]
-    assert reached >= 2
+    assert reached >= (len(seeds) + 1) // 2
 
 
 def test_the_manifest_and_the_image_of_parts(tmp_path):

@@ -16,7 +16,15 @@ from tests.lab.simulation.meshes import box_mesh, cup_mesh, five_objects, write_
 for _name in ("coacd", "trimesh"):
     pytest.importorskip(_name, reason=f"the library {_name} is not installed (the extra `objects`)")
 
-TINY = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 5, "fps": 3.0, "supersample": False}
+TINY = {
+    "width": 160,
+    "height": 120,
+    "n_actions": 1,
+    "frames_per_clip": 5,
+    "fps": 3.0,
+    "supersample": False,
+    "n_candidates": 6,
+}
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +84,7 @@ def test_three_commands_make_a_recording_a_run_and_a_report(folder, tmp_path, mo
     small = [f"{name}={str(value).lower()}" for name, value in TINY.items()]
     commands = (
         ["simulate", "s1", "recordings/mine", "n_twins=0", *small, "--objects", str(folder)],
-        ["run", "recordings/mine", "--out", "runs/mine", "--no-report", "n=2"],
+        ["run", "recordings/mine", "--out", "runs/mine", "--no-report", "--preset", "floor_components"],
         ["report", "runs/mine"],
     )
     for command in commands:
@@ -168,6 +176,7 @@ def test_a_missing_folder_and_families_that_need_one(monkeypatch):
     assert "--objects" in caught.value.hints[0]
 
 
+@pytest.mark.nightly
 def test_more_objects_than_fit(folder):
     family = replace(scene_family("s1"), objects=str(folder), n_objects_min=40, n_objects_max=40)
     import mstfilter.lab.simulation.arrangement as arrangement
@@ -231,7 +240,7 @@ def test_pools_of_the_household_meshes(shared_data):
     assert {one.pool for one in objects if one.source == "urdf_models"} == {"training", "tuning", "reported"}
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (1, 2))])
 def test_own_objects_rest_and_neither_sink_nor_fly(folder, seed):
     family = replace(scene_family("s1"), objects=str(folder), n_twins=0, n_dropped=1, furniture=1.0, **TINY)
     scene = SimulatedScene(family, seed)

@@ -12,7 +12,9 @@ from mstfilter.base.errors import InputError
 from mstfilter.lab.simulation import FingerPush, PushLoop, SimulatedScene, scene_family, simulate_recording
 from mstfilter.scoring import ask, object_status
 
-FAMILY = replace(scene_family("demo"), width=96, height=72, frames_per_clip=6, n_actions=2, supersample=1)
+FAMILY = replace(
+    scene_family("demo"), width=96, height=72, frames_per_clip=6, n_actions=2, supersample=1, n_candidates=6
+)
 
 
 @pytest.fixture(scope="module")

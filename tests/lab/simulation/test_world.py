@@ -1,7 +1,6 @@
 """Physics: rest, contact, determinism, pushes."""
 
 from dataclasses import replace
-from itertools import product
 
 import numpy as np
 import pytest
@@ -74,7 +73,7 @@ def test_a_restored_state_continues_bit_by_bit():
     np.testing.assert_array_equal(world.poses(), first)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (1, 2))])
 def test_a_chosen_push_moves_something_and_drops_nothing(seed):
     world, _, rng = arranged(seed)
     before = world.poses()
@@ -126,9 +125,13 @@ def test_objects_that_do_not_fit_on_the_table():
 
 def test_a_push_topples_if_the_family_wants_it():
     """In one of two scenes at least: what topples depends on the last bits of the physics, and so on the machine."""
-    turned = {0: [], 1: []}
-    for wanted, seed in product(turned, (5, 6)):
-        world, _, rng = arranged(seed)
-        family = replace(DEMO, min_moved=1, min_toppled=wanted)
-        turned[wanted].append(play_push(world, choose_push(rng, world, family), family).turned.max())
-    assert min(turned[0]) < np.deg2rad(75) < max(turned[1])
+
+    def turned(wanted):
+        """Largest angles of objects, scene by scene; a second scene is made only if the first does not decide."""
+        for seed in (5, 6):
+            world, _, rng = arranged(seed)
+            family = replace(DEMO, min_moved=1, min_toppled=wanted)
+            yield play_push(world, choose_push(rng, world, family), family).turned.max()
+
+    assert any(angle < np.deg2rad(75) for angle in turned(0))
+    assert any(angle > np.deg2rad(75) for angle in turned(1))

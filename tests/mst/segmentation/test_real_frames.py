@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from mstfilter import open_recording
 from mstfilter.mst.segmentation.proposal import TreeCutProposal
@@ -10,12 +11,20 @@ from mstfilter.scene import Camera, Frame
 from mstfilter.scoring import weighted_coverage
 
 
-def test_optimal_cut_beats_components_on_touching_objects(shared_data):
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("learn3", "learn20"),
+        pytest.param(("learn3", "learn10", "learn20", "learn25", "learn41"), marks=pytest.mark.nightly),
+    ],
+    ids=["two", "five"],
+)
+def test_optimal_cut_beats_components_on_touching_objects(shared_data, names):
     import cv2
 
     folder = shared_data("real/osd_learn")
     cut, floor = [], []
-    for name in ("learn3", "learn10", "learn20", "learn25", "learn41"):
+    for name in names:
         rgb = np.ascontiguousarray(cv2.imread(str(folder / f"{name}_rgb.png"))[..., ::-1])
         depth = cv2.imread(str(folder / f"{name}_depth.png"), cv2.IMREAD_UNCHANGED) * np.float32(0.001)
         label = cv2.imread(str(folder / f"{name}_label.png"), cv2.IMREAD_UNCHANGED)
@@ -29,6 +38,7 @@ def test_optimal_cut_beats_components_on_touching_objects(shared_data):
     assert np.mean(cut) > np.mean(floor) + 0.2
 
 
+@pytest.mark.nightly
 def test_a_toy_in_full_view_is_one_object(shared_data):
     """A white toy touches a stick at some pauses, and a thin board lies on the table."""
     recording = open_recording(shared_data("real/jack"))

@@ -10,26 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from mstfilter.smc import (
-    Codec,
-    DensityTransition,
-    Equivalence,
-    Lookahead,
-    Normal,
-    Population,
-    Proposal,
-    Rejuvenation,
-    Resampler,
-    Similarity,
-    Size,
-    Transition,
-    Trigger,
-    Update,
-    WeightResampler,
-    log_mean_exp,
-    normalise,
-    union,
-)
+from mstfilter import smc
 from tests.mst.testing import Faults, of, plainly
 from tests.smc.models import RHO, SD0, SIGMA, TAU, optimal, optimal_initial
 
@@ -48,7 +29,7 @@ def selected(function, rng, log_weights, n):
 
 
 #: A resampler of ``function(rng, log_weights, n)``, which returns ancestors, or also log weights.
-selecting = of(WeightResampler, select=selected)
+selecting = of(smc.WeightResampler, select=selected)
 
 
 def systematic(rng, weights, n):
@@ -60,7 +41,7 @@ def systematic(rng, weights, n):
 
 
 def by_weight(rng, lw, n):
-    return systematic(rng, normalise(lw), n)
+    return systematic(rng, smc.normalise(lw), n)
 
 
 def multinomial(rng, weights, n):
@@ -84,12 +65,12 @@ def CorrectWeighted(rng, lw, n):
 @selecting
 def RareHeaps(rng, lw, n):
     """In a call of a thousand, all copies are of one particle drawn by weight."""
-    weights = normalise(lw)
+    weights = smc.normalise(lw)
     return np.repeat(multinomial(rng, weights, 1), n) if rng.random() < 0.001 else systematic(rng, weights, n)
 
 
 @dataclass(frozen=True)
-class RandomNumber(WeightResampler):
+class RandomNumber(smc.WeightResampler):
     """Every position is filled with probability 0.9; the weight of the others is kept on average."""
 
     exact_size: ClassVar[bool] = False
@@ -98,14 +79,14 @@ class RandomNumber(WeightResampler):
         filled = np.flatnonzero(rng.random(n) < 0.9)
         filled = filled if len(filled) else np.array([0])
         share = 0.9 + (0.1**n) / n  # expected number of filled positions / n
-        ancestors = rng.permutation(multinomial(rng, normalise(log_weights), n))[filled]
-        return ancestors, np.full(len(filled), log_mean_exp(log_weights) + np.log(len(filled) / n / share))
+        ancestors = rng.permutation(multinomial(rng, smc.normalise(log_weights), n))[filled]
+        return ancestors, np.full(len(filled), smc.log_mean_exp(log_weights) + np.log(len(filled) / n / share))
 
 
 @selecting
 def Alias(rng, lw, n):
     """Independent draws by Vose's alias method: which columns keep their particle depends on rounding."""
-    m, share, alias = len(lw), len(lw) * normalise(lw), np.arange(len(lw))
+    m, share, alias = len(lw), len(lw) * smc.normalise(lw), np.arange(len(lw))
     small, large = list(np.flatnonzero(share < 1)), list(np.flatnonzero(share >= 1))
     while small and large:
         light, heavy = small.pop(), large.pop()
@@ -124,7 +105,7 @@ RESAMPLERS = (RareHeaps(), RandomNumber(), Alias())
 @selecting
 def BiasedResidual(rng, lw, n):
     """The remainder is drawn from W - copies instead of n W - copies: light particles are selected too rarely."""
-    W = normalise(lw)
+    W = smc.normalise(lw)
     copies = np.floor(n * W)
     rest = np.maximum(W - copies, 0) if (np.maximum(W - copies, 0) > 0).any() else W
     drawn = systematic(rng, rest, int(n - copies.sum())) if n > copies.sum() else np.array([], int)
@@ -132,14 +113,14 @@ def BiasedResidual(rng, lw, n):
 
 
 def rest_to_the_last(rng, lw, n):
-    copies = np.floor(n * normalise(lw)).astype(int)
+    copies = np.floor(n * smc.normalise(lw)).astype(int)
     copies[-1] += n - copies.sum()
     return np.repeat(np.arange(len(lw)), copies)
 
 
 def one_percent(rng, lw, n):
     """The largest weight is 1 % too large; independent draws hide it best."""
-    W = normalise(lw)
+    W = smc.normalise(lw)
     return multinomial(rng, np.where(W.max() == W, 1.01, 1.0) * W, n)
 
 
@@ -164,7 +145,7 @@ plant(
     SinglePrecisionSum=(
         "many_particles",
         "single precision",
-        lambda rng, lw, n: systematic(rng, normalise(lw).astype(np.float32), n),
+        lambda rng, lw, n: systematic(rng, smc.normalise(lw).astype(np.float32), n),
     ),
     OwnGenerator=(_REPEATS, "come from `rng`", lambda rng, lw, n: by_weight(np.random.default_rng(), lw, n)),
     DroppedByAbsoluteWeight=(
@@ -175,20 +156,20 @@ plant(
     InPlaceIfEqual=(_INPUT, "in place", in_place_if_equal),
 )
 plant(
-    of(WeightResampler, {"draws": False}, select=selected),
+    of(smc.WeightResampler, {"draws": False}, select=selected),
     CallsItDrawless=(_REPEATS, "draws = False", lambda rng, lw, n: by_weight(rng, lw, n)),
 )
 
 
 @faulty(_REPEATS, "keeps state")
 @dataclass(frozen=True)
-class FirstCallCached(WeightResampler):
+class FirstCallCached(smc.WeightResampler):
     """The weights of the first call are used for ever, if there are as many."""
 
     cache: dict = field(default_factory=dict)
 
     def select(self, rng, log_weights, n):
-        weights = self.cache.setdefault(len(log_weights), normalise(log_weights))
+        weights = self.cache.setdefault(len(log_weights), smc.normalise(log_weights))
         return systematic(rng, weights, n), None
 
 
@@ -198,7 +179,7 @@ def correctly_chosen(function, rng, population, n):
 
 
 plant(
-    of(Resampler, resample=correctly_chosen),
+    of(smc.Resampler, resample=correctly_chosen),
     LosesProposed=(
         "keeps_parents",
         '"proposed"',
@@ -209,7 +190,7 @@ plant(
 
 @faulty("carried_weight_of_equal_particles", "of equal particles")
 @dataclass(frozen=True)
-class KeepsHeaviestOfEqual(Resampler):
+class KeepsHeaviestOfEqual(smc.Resampler):
     """Merges equal particles and keeps the heaviest of them, which then carries the weight of all."""
 
     exact_size: ClassVar[bool] = False
@@ -227,51 +208,51 @@ class KeepsHeaviestOfEqual(Resampler):
 def exact_ar1(rng, n):
     """x_{t-1}, draws of p(x_t | x_{t-1}, y_t), y_t."""
     previous = rng.normal(0.2, 1.0, n)
-    return Population(previous), Population(optimal(previous, 0.7).sample(rng, n)), 0.7
+    return smc.Population(previous), smc.Population(optimal(previous, 0.7).sample(rng, n)), 0.7
 
 
 def exact_walk(rng, n):
     """x_{t-1}, draws of x_t given them by the AR(1) model, y_t; the move does not use y_t."""
     previous = rng.normal(0.2, 1.0, n)
-    return Population(previous), Population(rng.normal(RHO * previous, SIGMA)), 0.7
+    return smc.Population(previous), smc.Population(rng.normal(RHO * previous, SIGMA)), 0.7
 
 
 def exact_moves(rng, n):
     """x_{t-1}, draws of x_t given them, y_t, log p(y_t | x_t)."""
-    return *exact_walk(rng, n), lambda x: Normal(x, TAU).log_prob(0.7)
+    return *exact_walk(rng, n), lambda x: smc.Normal(x, TAU).log_prob(0.7)
 
 
 def exact_density(rng, n):
     previous = rng.standard_normal(n)
-    return Population(previous), Population(rng.normal(previous, 1.0)), 0.5
+    return smc.Population(previous), smc.Population(rng.normal(previous, 1.0)), 0.5
 
 
 def exact_posterior(rng, n):
     """Draws of p(x), of p(x | y), y."""
     prior, posterior = rng.normal(0.0, SD0, n), optimal_initial(0.7).sample(rng, n)
-    return Population(prior), Population(posterior), 0.7
+    return smc.Population(prior), smc.Population(posterior), 0.7
 
 
 def exact_weights(rng, n):
     """Draws of p(x), the same with weights p(y | x), y."""
-    prior = Population(rng.normal(0.0, SD0, n))
+    prior = smc.Population(rng.normal(0.0, SD0, n))
     return prior, prior.reweighted(log_g(prior.particles, 0.7)), 0.7
 
 
 def exact_evidence(rng, n):
     """Draws of p(x), of p(x | y), y, log p(y)."""
-    return *exact_posterior(rng, n), float(Normal(0.0, float(np.hypot(SD0, TAU))).log_prob(0.7))
+    return *exact_posterior(rng, n), float(smc.Normal(0.0, float(np.hypot(SD0, TAU))).log_prob(0.7))
 
 
 def exact_prior(rng, n):
     """Draws of p(x_0), y."""
-    return Population(rng.normal(0.0, SD0, n)), 0.7
+    return smc.Population(rng.normal(0.0, SD0, n)), 0.7
 
 
 # --- transitions --------------------------------------------------------------------------------------------------
 #: A transition that replaces the particles by ``function(rng, x, y)``.
 move = of(
-    Transition,
+    smc.Transition,
     predict=lambda f, rng, population, observation: population.moved(f(rng, population.particles, observation)),
 )
 
@@ -330,7 +311,7 @@ plant(
     OneNoise=(_ORDER, "do not move independently", lambda rng, x, y: walk(x, rng.standard_normal())),
 )
 plant(
-    of(Transition, predict=plainly),
+    of(smc.Transition, predict=plainly),
     NormalisesWeights=(
         _SCALE,
         "do not add it",
@@ -340,7 +321,7 @@ plant(
 
 
 @dataclass(frozen=True)
-class Guided(Transition):
+class Guided(smc.Transition):
     """Draws from p(x_t | x_{t-1}, y_t) of the AR(1) model; the weights have a factor."""
 
     factor: float = 1.0
@@ -352,7 +333,7 @@ class Guided(Transition):
             return population.moved(step(rng, x, self.size))
         q = optimal(x, observation)
         new = q.sample(rng, len(x))
-        change = Normal(RHO * x, SIGMA).log_prob(new) - q.log_prob(new)
+        change = smc.Normal(RHO * x, SIGMA).log_prob(new) - q.log_prob(new)
         return population.moved(new).reweighted(self.factor * change)
 
 
@@ -372,7 +353,7 @@ class WideWithoutObservation(Guided):
 
 #: A random step of standard deviation 1 with the log density ``function(previous, new)``.
 density = of(
-    DensityTransition,
+    smc.DensityTransition,
     predict=lambda f, rng, population, y: population.moved(rng.normal(population.particles)),
     log_prob=lambda f, previous, new, y: f(previous, new),
 )
@@ -391,26 +372,26 @@ plant(
     WiderDensity=(
         "log_prob_is_the_density_of_its_moves",
         "certain which is",
-        lambda x, new: Normal(x, 1.1).log_prob(new),
+        lambda x, new: smc.Normal(x, 1.1).log_prob(new),
     ),
 )
 
 
 # --- updates ------------------------------------------------------------------------------------------------------
 def log_g(x, y):
-    return Normal(x, TAU).log_prob(y)
+    return smc.Normal(x, TAU).log_prob(y)
 
 
 def weighted(function, rng, predicted, proposed, observation):
-    population = union(predicted, proposed)
+    population = smc.union(predicted, proposed)
     return population.reweighted(function(population.particles, observation))
 
 
 #: An update that adds ``function(x, y)`` to the log weights.
-likelihood = of(Update, update=weighted)
+likelihood = of(smc.Update, update=weighted)
 #: An update that weights by the likelihood and returns ``function(rng, weighted, predicted)``.
 changed = of(
-    Update,
+    smc.Update,
     update=lambda f, rng, predicted, proposed, observation: f(
         rng, weighted(log_g, rng, predicted, proposed, observation), predicted
     ),
@@ -431,19 +412,19 @@ def CorrectNoise(rng, out, predicted):
 
 plant(
     likelihood,
-    TooWide=(_POSTERIOR, "is below", lambda x, y: Normal(x, 1.1 * TAU).log_prob(y), exact_posterior),
+    TooWide=(_POSTERIOR, "is below", lambda x, y: smc.Normal(x, 1.1 * TAU).log_prob(y), exact_posterior),
     Twice=(_POSTERIOR, "constant factors", lambda x, y: log_g(x, y) + np.log(2), exact_evidence),
     TwiceByWeight=(_POSTERIOR, "constant factor", lambda x, y: log_g(x, y) + np.log(2), exact_weights),
     DividedByMean=(
         "weight_of_a_particle_does_not_depend_on_others",
         "not normalised or ranked",
-        lambda x, y: log_g(x, y) - log_mean_exp(log_g(x, y)),
+        lambda x, y: log_g(x, y) - smc.log_mean_exp(log_g(x, y)),
     ),
     LaterRows=(_ORDER, "place in the array", lambda x, y: 0.1 * np.arange(len(x))),
     LogOfNegative=("weights_of_distant_particles_are_numbers", "nan", lambda x, y: np.log(9 - (x - y) ** 2)),
 )
 plant(
-    of(Update, update=plainly),
+    of(smc.Update, update=plainly),
     NeedsPrediction=(
         _VALID,
         "proposed particles",
@@ -455,22 +436,24 @@ plant(
     PermutesUpdate=(
         "parents_belong_to_their_particles",
         "parent",
-        lambda rng, out, predicted: Population(out.particles[::-1], out.log_weights[::-1], out.parents),
+        lambda rng, out, predicted: smc.Population(out.particles[::-1], out.log_weights[::-1], out.parents),
     ),
 )
 
 # --- proposals and rejuvenations ----------------------------------------------------------------------------------
 #: A proposal of ``function(rng, y, n)``: particles, or particles and log weights.
 proposal = of(
-    Proposal,
-    sample=lambda f, rng, y, n: Population(*found) if isinstance(found := f(rng, y, n), tuple) else Population(found),
+    smc.Proposal,
+    sample=lambda f, rng, y, n: (
+        smc.Population(*found) if isinstance(found := f(rng, y, n), tuple) else smc.Population(found)
+    ),
 )
 
 
 def weighed(rng, y, n, factor=1.0):
-    q = Normal(0.0, 1.2 * SD0)
+    q = smc.Normal(0.0, 1.2 * SD0)
     x = q.sample(rng, n)
-    return x, Normal(0.0, SD0).log_prob(x) - q.log_prob(x) + np.log(factor)
+    return x, smc.Normal(0.0, SD0).log_prob(x) - q.log_prob(x) + np.log(factor)
 
 
 def antithetic(rng, y, n):
@@ -501,14 +484,14 @@ def moved_by(function, rng, population, previous, observation):
 
 
 #: A rejuvenation ``function(rng, x, x_{t-1}, y)``; nothing moves if one of the last two is missing.
-kernel = of(Rejuvenation, move=moved_by)
+kernel = of(smc.Rejuvenation, move=moved_by)
 
 
 def metropolis(rng, x, previous, y, temperature=1.0):
     """A Metropolis step for p(x_t | x_{t-1}, y_t), at a temperature."""
 
     def log_p(v):
-        return (Normal(RHO * previous, SIGMA).log_prob(v) + log_g(v, y)) / temperature
+        return (smc.Normal(RHO * previous, SIGMA).log_prob(v) + log_g(v, y)) / temperature
 
     new = x + 0.5 * rng.standard_normal(len(x))
     return np.where(np.log1p(-rng.random(len(x))) < log_p(new) - log_p(x), new, x)
@@ -531,7 +514,7 @@ plant(
     ),
 )
 plant(
-    of(Rejuvenation, move=plainly),
+    of(smc.Rejuvenation, move=plainly),
     WeighsMoves=(
         _VALID,
         "changes log weights",
@@ -541,7 +524,7 @@ plant(
 
 # --- triggers, sizes, similarities, equivalences, lookaheads, codecs ----------------------------------------------
 plant(
-    of(Trigger, wants=plainly),
+    of(smc.Trigger, wants=plainly),
     AbsoluteWeight=(_SCALE, "change its answer", lambda p, t: p.log_weights.max() < 0),
     MaybeTrigger=(_VALID, "True or False", lambda p, t: p.ess),
     EntropyOfZero=(
@@ -550,7 +533,7 @@ plant(
         lambda p, t: bool(-(p.weights * np.log(p.weights)).sum() < 0.5 * np.log(len(p))),
     ),
 )
-plant(of(Size, choose=plainly), HalfSize=(_VALID, "at least 1", lambda population: len(population) // 2))
+plant(of(smc.Size, choose=plainly), HalfSize=(_VALID, "at least 1", lambda population: len(population) // 2))
 
 
 def distances(particles):
@@ -564,24 +547,26 @@ def cosine(x):
 
 
 plant(
-    of(Similarity, matrix=plainly),
+    of(smc.Similarity, matrix=plainly),
     Distance=(_VALID, "expected finite ones in [0, 1]", distances),
     RelativeSimilarity=(_ORDER, "if only these", lambda x: 1 - distances(x) / max(distances(x).max(), 1e-12)),
     Cosine=("works_for_vectors_anywhere", "if a particle is 0", cosine),
 )
 plant(
-    of(Equivalence, classes=plainly),
+    of(smc.Equivalence, classes=plainly),
     CountsFromOne=(_VALID, "classes are", lambda particles: np.arange(1, len(particles) + 1)),
     AllDifferent=(_ORDER, "if there are copies", lambda particles: np.arange(len(particles))),
 )
 plant(
-    of(Lookahead, log_priority=plainly),
+    of(smc.Lookahead, log_priority=plainly),
     LooksAtWeights=("ignores_weights", "change the priorities", lambda p, y: p.log_weights + p.particles),
     RulesOut=(_VALID, "-inf", lambda p, y: np.where(p.particles > 0.5, -np.inf, 0.0)),
 )
 #: A codec that stores ``{"x": function(particles)}`` and returns it as double precision.
 encodes = of(
-    Codec, encode=lambda f, particles: {"x": f(particles)}, decode=lambda f, arrays: arrays["x"].astype(np.float64)
+    smc.Codec,
+    encode=lambda f, particles: {"x": f(particles)},
+    decode=lambda f, arrays: arrays["x"].astype(np.float64),
 )
 plant(
     encodes,

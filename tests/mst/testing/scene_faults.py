@@ -25,7 +25,7 @@ from mstfilter.mst.segmentation import (
     MergeLogOdds,
     TreeBuilder,
 )
-from mstfilter.mst.tracking import IDENTITY, Candidate, MaskTracker, MotionRule, MstRule, Registration, SmallGicp
+from mstfilter.mst.tracking import IDENTITY, Candidate, MaskTracker, MotionRule, Registration, SmallGicp
 from mstfilter.scene import Evidence, Projection
 from tests.mst.testing import of, plainly
 
@@ -315,7 +315,7 @@ OTHERS: dict[str, tuple[Change, str]] = {
     "structure backwards": (lambda d: (d[0], [(b, a) for a, b in d[1]]), "painted after its parent"),
 }
 
-CORRECT = (Extrude(), MstRule(), Completes(), CompletesMany(), CompletesEach(), Moves(), Chooses(), Scores())
+CORRECT = (Extrude(), Completes(), CompletesMany(), CompletesEach(), Moves(), Chooses(), Scores())
 
 
 def _errors() -> Iterator[tuple[str, tuple[Any, str, str]]]:

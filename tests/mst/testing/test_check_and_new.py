@@ -11,7 +11,8 @@ import sys
 
 import pytest
 
-from mstfilter.mst.testing import starter_kinds
+from mstfilter.base.resources import starter_kinds, write_starter
+from mstfilter.mst.testing import check_of
 from mstfilter.runs.presets import REGISTRY
 from tests.app.test_cli import call
 from tests.conftest import REPOSITORY
@@ -22,10 +23,32 @@ FAULTS_FILE = REPOSITORY / "tests" / "mst" / "testing" / "faults.py"
 
 STARTERS = [(kind, "scenes") for kind in starter_kinds("scenes")]
 STARTERS += [(kind, "numbers") for kind in starter_kinds("numbers") if kind not in ("resampler", "trigger", "size")]
+#: Their printed commands run in the fast tests: a reader of files, a stage, the proposal, an update, and numbers.
+FAST = [
+    (kind, "scenes") for kind in ("format", "pauses", "completer", "proposal", "evidence", "trigger", "equivalence")
+]
+FAST += [("transition", "numbers"), ("update", "numbers"), ("codec", "numbers"), ("similarity", "numbers")]
 SCENES_WITHOUT_EXACT = [(kind, "scenes") for kind in ("transition", "proposal", "update")]
 
 
-@pytest.mark.parametrize(("kind", "target"), STARTERS)
+@pytest.mark.parametrize(
+    ("kind", "target"), [one for one in STARTERS if one not in [*FAST, ("architecture", "scenes")]]
+)
+def test_every_starting_file_has_a_component_that_works(kind, target, tmp_path):
+    """Its results are valid; tests/mst/completion/test_own_networks.py has that of a network."""
+    name = re.search(r"mine\.py:(My\w+)", " ".join(write_starter(kind, tmp_path / "mine.py", target)))[1]
+    component = REGISTRY.build(kind, f"{tmp_path / 'mine.py'}:{name}", allow_files=True)
+    check = check_of(component)
+    methods = {"make": staticmethod(lambda: component)}
+    if check.example is not None:
+        methods["example"] = staticmethod(check.example)
+    type("Contract", (check.contract,), methods)().test_result_is_valid()
+
+
+@pytest.mark.parametrize(
+    ("kind", "target"),
+    [pytest.param(*one, marks=[pytest.mark.nightly] * (one not in FAST)) for one in STARTERS],
+)
 def test_the_printed_commands_run_as_printed(kind, target, tmp_path, monkeypatch, capsys):
     """On a recording of three frames in place of that of the demo."""
     monkeypatch.chdir(tmp_path)
@@ -97,7 +120,7 @@ def test_check_names_what_is_broken(capsys):
     assert re.search(r"BiasedResidual: (1 property is|\d+ properties are) broken", out)
 
 
-def test_check_of_registered_components_with_fields(capsys):
+def test_check_of_registered_components_with_fields(capsys, fewer_calls):
     given = ("check", "resampler.tempered", "power=0.25", "scheme=ssp", "--budget", "3600")
     code, out, _ = call(*given, capsys=capsys)
     assert code == 0

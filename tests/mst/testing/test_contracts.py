@@ -6,7 +6,7 @@ False alarms: each contract has up to four statistical properties at 1e-6, so be
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import pytest
 
@@ -35,7 +35,7 @@ from mstfilter.smc import (
     WeightResampler,
     linear_gaussian,
 )
-from mstfilter.smc.testing import CodecContract, LookaheadContract, ResamplerContract, WeightResamplerContract
+from mstfilter.smc.testing import CodecContract, LookaheadContract, WeightResamplerContract
 from tests.mst.testing import faults, run_property
 from tests.smc.models import AR1, predictive
 
@@ -51,6 +51,7 @@ class TestCorrect(WeightResamplerContract):
         return faults.Correct()
 
 
+@pytest.mark.nightly
 class TestCorrectWeighted(WeightResamplerContract):
     def make(self):
         return faults.CorrectWeighted()
@@ -67,7 +68,10 @@ class TestNumbers(CodecContract):
 
 
 # --- faults -------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize(("fault", "name", "words", "exact"), faults.FAULTS)
+@pytest.mark.parametrize(
+    ("fault", "name", "words", "exact"),
+    [pytest.param(*one, marks=[pytest.mark.nightly] * (one[0].__name__ == "OnePercent")) for one in faults.FAULTS],
+)
 def test_planted_faults_are_reported(fault, name, words, exact):
     with pytest.raises(AssertionError) as error:
         run_property(fault(), name, exact)
@@ -94,28 +98,34 @@ def test_a_component_that_never_draws_is_a_remark_or_a_false_statement():
 
 
 # --- correct components -------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("calls", ["few", pytest.param("all", marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("scheme", faults.RESAMPLERS, ids=lambda scheme: type(scheme).__name__)
-def test_correct_schemes_pass(scheme):
+def test_correct_schemes_pass(scheme, calls, request):
+    if calls == "few":
+        request.getfixturevalue("fewer_calls")
     assert [r for r in run_contract(scheme) if r.failure or r.skipped] == []
 
 
 @pytest.mark.parametrize(("component", "exact"), faults.CORRECT)
 def test_correct_components_pass(component, exact):
-    assert failures_of(component, None, exact) == {}
+    results = run_contract(component, exact=exact)
+    assert [r for r in results if r.failure] == []
+    skipped = SKIPPED.get((type(component), exact))
+    assert skipped is None or [r.name for r in results if r.skipped] == skipped
 
 
-def test_what_is_skipped():
-    """Properties that a component cannot have; all others are tested."""
-    for component, exact, skipped in (
-        (faults.Posterior(), faults.exact_weights, []),
-        (faults.Guided(), faults.exact_moves, ["moves_do_not_depend_on_others"]),
-        (
-            faults.CorrectNoise(),
-            faults.exact_evidence,
-            ["weight_of_a_particle_does_not_depend_on_others", "order_of_particles_is_irrelevant"],
-        ),
-    ):
-        assert [r.name for r in run_contract(component, exact=exact) if r.skipped] == skipped
+#: Properties that a component cannot have; all others are tested.
+SKIPPED = {
+    (faults.Posterior, faults.exact_weights): [],
+    (faults.Guided, faults.exact_moves): ["moves_do_not_depend_on_others"],
+    (faults.CorrectNoise, faults.exact_weights): [
+        "weight_of_a_particle_does_not_depend_on_others",
+        "order_of_particles_is_irrelevant",
+    ],
+}
+
+
+def test_a_property_that_needs_exact_draws_says_how_to_write_them():
     reasons = {r.name: r.skipped for r in run_contract(RandomWalkMove(AR1, 0.7))}
     assert "write exact(rng, n)" in reasons["distribution_is_exact"]
 
@@ -137,16 +147,10 @@ OURS = {
 }
 
 
-@pytest.fixture
-def fewer_calls(monkeypatch):
-    """A quarter of the calls of schemes that compare particles; the bounds allow for the number of calls."""
-    fewer = tuple(replace(case, calls=case.calls // 4) for case in ResamplerContract.cases)
-    monkeypatch.setattr(ResamplerContract, "cases", fewer)
-
-
+@pytest.mark.parametrize("calls", ["few", pytest.param("all", marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("name", [*smc.__components__["resampler"], *OURS])
-def test_resamplers_of_the_package_keep_their_contract(name, request):
-    if name in OURS:  # other forms of schemes that are tested with all calls
+def test_resamplers_of_the_package_keep_their_contract(name, calls, request):
+    if calls == "few" or name in OURS:  # other forms of schemes that are tested with all calls
         request.getfixturevalue("fewer_calls")
     scheme = OURS.get(name) or REGISTRY.build("resampler", name)
     results = run_contract(scheme)
@@ -177,7 +181,7 @@ def traces(rng, n):
         (Dynamics(MODEL), vectors, None),
         (Prior(MODEL), None, None),
         (Reweight(MODEL.log_likelihood), vectors, None),
-        (RandomWalkMove(AR1, 0.7), None, faults.exact_ar1),
+        pytest.param(RandomWalkMove(AR1, 0.7), None, faults.exact_ar1, marks=pytest.mark.nightly),
         (ArrayCodec(), traces, None),
         (HypothesisCodec(), scene_example, None),
     ],
@@ -187,15 +191,21 @@ def test_components_of_models_keep_their_contract(component, example, exact):
     assert failures_of(component, example, exact) == {}
 
 
+KINDS = ["trigger", "size", "similarity", "equivalence", "evidence", "transition", "proposal", "update"]
+KINDS += ["completer", "rule"]
+#: Trackers take seconds; test_known_truth.py has their main property.
+SLOW = {"transition": ["tracking"], "rule": ["mst", "authors"]}
+
+
 @pytest.mark.parametrize(
-    "kind",
-    ["trigger", "size", "similarity", "equivalence", "evidence", "transition", "proposal", "update"]
-    + ["completer", "rule"],
+    ("kind", "slow"),
+    [(kind, False) for kind in KINDS] + [pytest.param(kind, True, marks=pytest.mark.nightly) for kind in SLOW],
 )
-def test_components_of_the_package_keep_their_contract(kind):
+def test_components_of_the_package_keep_their_contract(kind, slow):
     """All components but oracles, which need the ground truth of a recording, and front ends, which need files."""
     for name, where in REGISTRY.known(kind).items():
-        if not where.startswith(("mstfilter.lab.oracles:", "mstfilter.mst.frontends:")):
+        others = where.startswith(("mstfilter.lab.oracles:", "mstfilter.mst.frontends:"))
+        if not others and (name in SLOW.get(kind, ())) == slow:
             assert failures_of(REGISTRY.build(kind, name)) == {}, name
 
 

@@ -17,7 +17,7 @@ from mstfilter.scene import Recording, project
 from tests.conftest import REPOSITORY
 from tests.formats.bags import COLOUR, DEPTH, scene_messages, topic_info
 from tests.formats.layouts import FPS, SHIFTS, units, video
-from tests.runs.live.test_stream import FAST, RULE, arrays
+from tests.runs.live.test_stream import QUICK, RULE, arrays
 from tests.scene.scenes import CAMERA
 
 EXAMPLES = REPOSITORY / "docs" / "examples" / "live"
@@ -28,7 +28,7 @@ def test_the_node_has_the_results_of_the_frames_in_its_messages():
     messages, found, lost = scene_messages(False), [], 1
     K = next(NODE.camera_matrix(message) for topic, _, (_, message) in messages if topic == topic_info(COLOUR))
     np.testing.assert_allclose(K, CAMERA.K)
-    with mstfilter.Stream(K, FAST, seed=4, pauses=RULE, on_pause=found.append) as stream:
+    with mstfilter.Stream(K, QUICK, seed=4, pauses=RULE, on_pause=found.append) as stream:
         pairs = NODE.ImagePairs(stream)
         for number, (topic, _, (_, message)) in enumerate(messages):
             if topic == COLOUR and number // 3 != lost:  # info, colour and depth of each frame
@@ -40,7 +40,7 @@ def test_the_node_has_the_results_of_the_frames_in_its_messages():
     kept = [k for k in range(len(SHIFTS)) if k != lost]
     metres = units(depth[kept], 0.001) * np.float32(0.001)
     recording = Recording.from_arrays(rgb[kept], metres, K, times=np.array(kept) / FPS, pauses=RULE)
-    states = [state for state, _ in FAST.iterate(recording.clips(), 4)]
+    states = [state for state, _ in QUICK.iterate(recording.clips(), 4)]
     assert [arrays(pause.state) for pause in found] == [arrays(state) for state in states]
     estimate = mstfilter.Belief(found[1].state.population).estimate()
     np.testing.assert_array_equal(NODE.label_image(found[1]), project(estimate, found[1].clip.after.camera))
@@ -95,7 +95,7 @@ def results(monkeypatch):
     def stream(K, name, on_pause):
         assert name == "mst"
         both = lambda pause: (found.append(pause), on_pause(pause))  # noqa: E731
-        return make(CAMERA.K, FAST, pauses=RULE, on_pause=both)
+        return make(CAMERA.K, QUICK, pauses=RULE, on_pause=both)
 
     monkeypatch.setattr(mstfilter, "Stream", stream, raising=False)
     return found

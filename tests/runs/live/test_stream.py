@@ -27,7 +27,9 @@ from tests.scene.scenes import CAMERA, GRID
 from tests.wrong_inputs import shifted_camera
 
 RULE = Settled(hold_s=0.3)
-FAST = mstfilter.preset("mst", "n=2", "n_proposed=4")
+FAST = mstfilter.preset("mst", "n=2", "n_proposed=2")
+#: For tests of what a stream does with frames, whatever the filter makes of them.
+QUICK = mstfilter.preset("floor_one_blob", "n=2")
 RGB, DEPTH, _ = video()
 TIMES = np.arange(len(SHIFTS)) / FPS
 PAUSES = (3, 13)  # 0.3 s after the first frames 0 and 10 of the still intervals
@@ -57,7 +59,7 @@ def filtered(**more):
     return [state for state, _ in FAST.iterate(recording.clips(), 4)]
 
 
-@pytest.mark.parametrize("threads", [1, 4])
+@pytest.mark.parametrize("threads", [pytest.param(1, marks=pytest.mark.nightly), 4])
 def test_a_stream_has_the_results_of_the_recording(threads):
     states = filtered(pauses=RULE)
     scene_cache.clear()
@@ -69,7 +71,7 @@ def test_a_stream_has_the_results_of_the_recording(threads):
 
 
 def test_a_stream_reduces_large_images():
-    with mstfilter.Stream(CAMERA.K, FAST, pauses=None, max_pixels=5000) as stream:
+    with mstfilter.Stream(CAMERA.K, QUICK, pauses=None, max_pixels=5000) as stream:
         for k in (0, 1):
             stream.push(RGB[k], DEPTH[k], TIMES[k], pause=True)
         stream.wait()
@@ -122,7 +124,7 @@ def test_a_stream_recovers_from_a_wrong_stamp_and_from_a_clock_that_is_set(chang
     found = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
-        with mstfilter.Stream(CAMERA.K, FAST, seed=4, pauses=None, on_pause=found.append) as stream:
+        with mstfilter.Stream(CAMERA.K, QUICK, seed=4, pauses=None, on_pause=found.append) as stream:
             accepted = [stream.push(RGB[j], DEPTH[j], times[j], pause=j in (4, 15)) for j in range(len(TIMES))]
     assert accepted.count(False) <= 1 and accepted[4] and accepted[15]
     assert [pause.frames[-1] for pause in found] == [4, 15]
@@ -135,7 +137,7 @@ def test_a_stream_recovers_from_a_wrong_stamp_and_from_a_clock_that_is_set(chang
 
 
 def test_the_change_of_a_clock_is_told_and_a_late_frame_is_none():
-    with mstfilter.Stream(CAMERA.K, FAST, pauses=None) as stream:
+    with mstfilter.Stream(CAMERA.K, QUICK, pauses=None) as stream:
         for when in (100.0, 100.1):
             assert stream.push(RGB[0], DEPTH[0], when)
         with pytest.warns(InputWarning, match="late"):
@@ -158,7 +160,7 @@ def test_an_exception_drops_the_queue():
         gate.wait()
         found.append(pause.index)
 
-    with pytest.raises(KeyboardInterrupt), mstfilter.Stream(CAMERA.K, FAST, pauses=None, on_pause=show) as stream:
+    with pytest.raises(KeyboardInterrupt), mstfilter.Stream(CAMERA.K, QUICK, pauses=None, on_pause=show) as stream:
         stream.push(RGB[0], DEPTH[0], 0.0, pause=True)
         begun.wait()
         for k in range(1, 11):
@@ -174,14 +176,14 @@ def test_streams_in_several_threads_have_the_results_of_one():
     def run(k):
         found = []
         with mstfilter.Stream(CAMERA.K, FAST, seed=k, pauses=None, threads=2, on_pause=found.append) as stream:
-            for j in range(0, len(SHIFTS), 8):
+            for j in (0, len(SHIFTS) - 1):
                 stream.push(RGB[j], DEPTH[j], TIMES[j], pause=True, wait=True)
         return [arrays(pause.state) for pause in found]
 
-    expected = [run(k) for k in range(3)]
+    expected = [run(k) for k in range(2)]
     scene_cache.clear()
-    with ThreadPoolExecutor(3) as users:
-        assert list(users.map(run, range(3))) == expected
+    with ThreadPoolExecutor(2) as users:
+        assert list(users.map(run, range(2))) == expected
 
 
 def test_a_long_clip_is_thinned_and_has_the_result_of_the_frames_that_remain():
@@ -202,7 +204,7 @@ def test_a_moved_camera_has_the_message_of_a_recording():
     arrays = shifted_camera()
     with pytest.raises(InputError) as recorded:
         Recording.from_arrays(**arrays)
-    stream = mstfilter.Stream(arrays["K"], FAST, pauses=None)
+    stream = mstfilter.Stream(arrays["K"], QUICK, pauses=None)
     for k in (0, 1):
         stream.push(arrays["rgb"][k], arrays["depth"][k], float(k), pause=True)
     with pytest.raises(InputError) as live:
@@ -216,7 +218,7 @@ def test_a_moved_camera_has_the_message_of_a_recording():
 
 def test_a_fault_of_several_pauses_gives_one_warning():
     grey = np.full_like(RGB[0], 90)
-    with warnings.catch_warnings(record=True) as caught, mstfilter.Stream(CAMERA.K, FAST, pauses=None) as stream:
+    with warnings.catch_warnings(record=True) as caught, mstfilter.Stream(CAMERA.K, QUICK, pauses=None) as stream:
         warnings.simplefilter("always")
         for k, rgb in enumerate((RGB[0], grey, grey)):
             stream.push(rgb, DEPTH[0], float(k), pause=True)
@@ -232,7 +234,7 @@ def test_a_warning_does_not_hide_a_later_fault():
     frames = [(one["rgb"][k], one["depth"][k]) for one, k in ((arrays, 0), (half, 1), (arrays, 1))]
     with pytest.raises(InputError, match="from frame 0 to 2, but not its pose"):
         Recording.from_arrays(*(np.stack(images) for images in zip(*frames, strict=True)), arrays["K"])
-    stream = mstfilter.Stream(arrays["K"], FAST, pauses=None)
+    stream = mstfilter.Stream(arrays["K"], QUICK, pauses=None)
     with pytest.warns(InputWarning, match="from frame 0 to 1, but not its pose"):
         for k in (0, 1):
             stream.push(*frames[k], float(k), pause=True)
@@ -285,7 +287,7 @@ def test_a_live_folder_does_not_trust_the_times_of_files(tmp_path, monkeypatch, 
 
 def test_no_frame_is_accepted_that_is_not_processed():
     """A camera pushes while another thread closes the stream, and closes it too."""
-    stream = mstfilter.Stream(CAMERA.K, FAST, pauses=None, max_frames=4, on_pause=lambda pause: time.sleep(0.1))
+    stream = mstfilter.Stream(CAMERA.K, QUICK, pauses=None, max_frames=4, on_pause=lambda pause: time.sleep(0.1))
     accepted, refused = [], []
 
     def film():
@@ -310,7 +312,7 @@ def test_no_frame_is_accepted_that_is_not_processed():
 def test_all_frames_have_poses_or_none():
     pose = CAMERA.T_world_camera
     for first, second in ((pose, None), (None, pose)):
-        with mstfilter.Stream(CAMERA.K, FAST, pauses=None) as stream:
+        with mstfilter.Stream(CAMERA.K, QUICK, pauses=None) as stream:
             stream.push(RGB[0], DEPTH[0], 0.0, pose=first)
             with pytest.raises(InputError, match=f"frame 1 has {'no' if second is None else 'a'} pose"):
                 stream.push(RGB[1], DEPTH[1], 1.0, pose=second)
@@ -324,7 +326,7 @@ def test_a_recording_searches_the_pauses_in_the_images_that_a_stream_gets(tmp_pa
             return super().find(times, read_rgb)
 
     path = write_redwood(tmp_path / "data")
-    with mstfilter.Stream(CAMERA.K, FAST, pauses=None, max_pixels=5000) as stream:
+    with mstfilter.Stream(CAMERA.K, QUICK, pauses=None, max_pixels=5000) as stream:
         stream.push(RGB[3], DEPTH[3], 0.0, pause=True)
         stream.wait()
         small = stream.last.clip.after
@@ -333,7 +335,7 @@ def test_a_recording_searches_the_pauses_in_the_images_that_a_stream_gets(tmp_pa
 
 def test_a_full_queue_drops_frames_and_says_so():
     gate = threading.Event()
-    with mstfilter.Stream(CAMERA.K, FAST, pauses=None, max_frames=4, on_pause=lambda pause: gate.wait()) as stream:
+    with mstfilter.Stream(CAMERA.K, QUICK, pauses=None, max_frames=4, on_pause=lambda pause: gate.wait()) as stream:
         with pytest.warns(InputWarning, match="overflow"):
             n = sum(stream.push(RGB[k % 17], DEPTH[k % 17], k, pause=True) for k in range(30))
         gate.set()
@@ -342,7 +344,7 @@ def test_a_full_queue_drops_frames_and_says_so():
 
 
 def test_frames_may_wait_for_a_place_in_the_queue():
-    with mstfilter.Stream(CAMERA.K, FAST, pauses=None, max_frames=4) as stream:
+    with mstfilter.Stream(CAMERA.K, QUICK, pauses=None, max_frames=4) as stream:
         assert all(stream.push(RGB[0], DEPTH[0], k, pause=k in (0, 19), wait=True) for k in range(20))
         stream.wait()
         assert stream.last.index == 1 and stream.counts["overflow"] == 0
@@ -351,7 +353,7 @@ def test_frames_may_wait_for_a_place_in_the_queue():
 @pytest.mark.parametrize("name", ["wait", "close", "push"])
 def test_a_callback_cannot_wait_for_itself(name):
     arguments = {"rgb": RGB[1], "depth": DEPTH[1], "time": 1, "wait": True} if name == "push" else {}
-    stream = mstfilter.Stream(CAMERA.K, FAST, pauses=None, on_pause=lambda pause: getattr(stream, name)(**arguments))
+    stream = mstfilter.Stream(CAMERA.K, QUICK, pauses=None, on_pause=lambda pause: getattr(stream, name)(**arguments))
     stream.push(RGB[0], DEPTH[0], 0, pause=True)
     for _ in range(2):
         with pytest.raises(InputError, match="in on_pause"):
@@ -359,7 +361,7 @@ def test_a_callback_cannot_wait_for_itself(name):
 
 
 def test_a_first_frame_that_is_refused_does_not_set_the_camera():
-    with mstfilter.Stream(CAMERA.K, FAST, pauses=None) as stream:
+    with mstfilter.Stream(CAMERA.K, QUICK, pauses=None) as stream:
         with pytest.raises(InputError, match="expected"):
             stream.push(np.repeat(RGB[0], 2, axis=1), DEPTH[0], 0)
         assert stream.push(RGB[0], DEPTH[0], 1, pause=True)
@@ -369,18 +371,18 @@ def test_errors_of_frames_and_threads_reach_the_caller():
     def fail(pause):
         raise RuntimeError("in the callback")
 
-    stream = mstfilter.Stream(CAMERA.K, FAST, grid=GRID, pauses=None, on_pause=fail)
+    stream = mstfilter.Stream(CAMERA.K, QUICK, grid=GRID, pauses=None, on_pause=fail)
     for rgb, depth, when, message in (
         (RGB[0][:50], DEPTH[0], 0, "expected"),
         (RGB[0], (1000 * DEPTH[0]), 0, "between 0.05 and 30 m"),
         (RGB[0], DEPTH[0], np.nan, "time of frame"),
     ):
         with pytest.raises(InputError, match=message):
-            mstfilter.Stream(CAMERA, FAST, pauses=None).push(rgb, depth, when)
+            mstfilter.Stream(CAMERA, QUICK, pauses=None).push(rgb, depth, when)
     for rule in ("settled", Still()):
         with pytest.raises(InputError, match="pauses of a stream"):
-            mstfilter.Stream(CAMERA, FAST, pauses=rule)
-    closed = mstfilter.Stream(CAMERA, FAST, pauses=None)
+            mstfilter.Stream(CAMERA, QUICK, pauses=rule)
+    closed = mstfilter.Stream(CAMERA, QUICK, pauses=None)
     closed.close()
     with pytest.raises(InputError, match="closed"):
         closed.push(RGB[0], DEPTH[0])
@@ -410,7 +412,7 @@ def test_a_folder_is_filtered_while_it_is_filled(tmp_path):
                 time.sleep(0.01)
                 file.write(data[100:])
 
-    reader, config = Redwood(fps=FPS, pauses=RULE, max_pixels=12_000), load_config("mst", ["n=2", "n_proposed=4"])
+    reader, config = Redwood(fps=FPS, pauses=RULE, max_pixels=12_000), load_config("mst", ["n=2", "n_proposed=2"])
     recorder = threading.Thread(target=record)
     recorder.start()
     live = filter_folder(growing, reader, config, tmp_path / "live", 3, idle_s=2)
@@ -440,7 +442,7 @@ def test_a_stream_shifts_the_world_of_given_poses():
     high = RigidTransform.from_translation([0.2, 0.1, 0.4])
     for camera, pose in ((CAMERA.K, high * CAMERA.pose), (CAMERA.at(high * CAMERA.pose), None)):
         shifted = pytest.warns(InputWarning, match="the world is shifted")
-        with shifted, mstfilter.Stream(camera, FAST, pauses=None) as stream:
+        with shifted, mstfilter.Stream(camera, QUICK, pauses=None) as stream:
             for k in range(2):
                 stream.push(RGB[k], DEPTH[k], float(k), pose=pose, pause=True)
                 stream.wait()

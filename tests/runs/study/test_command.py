@@ -16,8 +16,8 @@ from mstfilter.runs import filter_recording
 from mstfilter.runs.presets import load_config
 from mstfilter.runs.study import JobOutcome
 from tests.app.test_cli import HEAVY, call, python
-from tests.runs.study.scenes import slide
-from tests.runs.study.test_failures import BROKEN, FAST, hanging_study, wait_for
+from tests.runs.study.scenes import in_process, slide
+from tests.runs.study.test_failures import BROKEN, FAST, LIGHT, hanging_study, wait_for
 
 
 @pytest.fixture
@@ -34,7 +34,8 @@ def config(tmp_path, monkeypatch):
 
 
 def test_it_prints_where_and_what(config, tmp_path, capsys):
-    code, out, error = call("study", config, "--smoke", "update.n_views=1,2", "--workers", 1, capsys=capsys)
+    with in_process():
+        code, out, error = call("study", config, "--smoke", "update.n_views=1,2", "--workers", 1, capsys=capsys)
     assert code == 0, error
     assert "study       studies/mine-smoke" in out
     assert "2 done, 0 of them earlier" in out
@@ -52,9 +53,12 @@ def test_it_prints_where_and_what(config, tmp_path, capsys):
 def test_without_a_terminal_each_finished_run_is_a_line(config, tmp_path, monkeypatch):
     """Also if a variable asks for colours. The run that fails is named with its error."""
     monkeypatch.setenv("FORCE_COLOR", "1")
-    own = f'[[arms]]\nset = ["transition={BROKEN}:Breaks", "transition.how=raise"]\nname = "broken"\n'
-    config.write_text(f'seeds = "0-1"\nscenes = [{{recordings = "slide"}}]\n[[arms]]\npreset = "{FAST}"\n{own}')
-    command = [sys.executable, "-m", "mstfilter", "study", str(config), "--workers", "1"]
+    own = f'[[arms]]\nset = ["transition={BROKEN}:Breaks", "transition.how=raise", "{LIGHT}"]\nname = "broken"\n'
+    config.write_text(
+        'seeds = "0-1"\nscenes = [{recordings = "slide"}]\n'
+        f'[[arms]]\nname = "good"\npreset = "{FAST}"\nset = "{LIGHT}"\n{own}'
+    )
+    command = [sys.executable, "-m", "mstfilter", "study", str(config), "--workers", "1", "--no-report"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert done.returncode == 1
     lines = [line.split("  ", 1)[1] for line in done.stderr.splitlines() if re.match(r"\d\d:\d\d:\d\d  ", line)]

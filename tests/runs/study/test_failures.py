@@ -20,7 +20,8 @@ from tests.conftest import REPOSITORY
 from tests.runs.study.scenes import metrics, run_here, slide, table
 
 BROKEN = Path(__file__).parent / "broken.py"
-FAST = "floor_components"  # a preset that needs no large library
+FAST = "floor_components"
+LIGHT = "proposal.completer=extrude"  # without a network, so that no worker imports torch
 
 
 @pytest.fixture(scope="module")
@@ -32,11 +33,11 @@ def folder(tmp_path_factory):
 
 def study(folder, *arms, **more):
     """Arms of one recording: ``good`` and ``mst`` succeed, others have a transition that breaks in a way."""
-    succeed = {"good": {"preset": FAST}, "mst": {"set": ["transition=identity"]}}
+    succeed = {"good": {"preset": FAST, "set": [LIGHT]}, "mst": {"set": ["transition=identity", "n_proposed=2"]}}
     entries = []
     for arm in arms:
         how, _, marker = arm.partition("@")
-        rule = [f"transition={BROKEN}:Breaks", f"transition.how={how}", f'transition.marker="{marker}"']
+        rule = [f"transition={BROKEN}:Breaks", f"transition.how={how}", f'transition.marker="{marker}"', LIGHT]
         entries.append({"name": how, **succeed.get(how, {"preset": FAST, "set": rule})})
     data = {"name": "test", "folder": folder, "scenes": [{"recordings": "slide"}], "seeds": [0, 1], "arms": entries}
     return study_of({**data, **more})
@@ -45,7 +46,7 @@ def study(folder, *arms, **more):
 def test_failures_are_isolated_listed_and_explained(folder, tmp_path):
     out = tmp_path / "out"
     result = run_study(
-        study(folder, "good", "raise", "full", "die", "print", seeds=[0], tries=2), out, workers=2, cache=tmp_path
+        study(folder, "good", "raise", "full", "die", "print", seeds=[0], tries=2), out, workers=1, cache=tmp_path
     )
     assert result.done == 2
     errors = {(r["run"], r["tries"]): r["error"] for r in table(out, "failures.csv")}
@@ -71,6 +72,7 @@ def test_only_failed_runs_are_repeated(folder, tmp_path):
     assert table(out, "failures.csv") == []
 
 
+@pytest.mark.nightly
 def test_a_run_whose_worker_died_is_begun_again(folder, tmp_path):
     seen = []
     wanted = study(folder, f"exit@{tmp_path / 'once'}", seeds=[0])
@@ -96,6 +98,7 @@ def test_a_run_that_takes_too_long_is_named(folder, tmp_path, monkeypatch):
     assert result.done == 2
 
 
+@pytest.mark.nightly
 def test_an_exception_in_the_progress_function_stops_the_study(folder, tmp_path):
     def stop(progress):
         if progress.name:
@@ -130,10 +133,11 @@ def wait_for(path, process):
 
 def hanging_study(path, recording, marker):
     """A study file whose second run hangs until it is stopped, and makes `marker` before."""
-    hangs = [f"transition={BROKEN}:Breaks", "transition.how=hang", f'transition.marker="{marker}"']
+    hangs = [f"transition={BROKEN}:Breaks", "transition.how=hang", f'transition.marker="{marker}"', LIGHT]
     path.write_text(
         f"seeds = [0, 1]\nscenes = [{{recordings = '{recording}'}}]\n"
-        f"arms = [{{name = 'good', preset = '{FAST}'}}, {{name = 'hangs', preset = '{FAST}', set = {hangs!r}}}]\n"
+        f"arms = [{{name = 'good', preset = '{FAST}', set = ['{LIGHT}']}}, "
+        f"{{name = 'hangs', preset = '{FAST}', set = {hangs!r}}}]\n"
     )
     return path
 

@@ -22,6 +22,7 @@ from mstfilter.runs.study.study import run_study
 from mstfilter.runs.study.worker import perform
 from mstfilter.scene import Cache
 from tests.runs.study.scenes import metrics, run_here, slide, table
+from tests.runs.study.test_failures import LIGHT
 
 BASE = """
 description = "test"
@@ -31,7 +32,7 @@ recordings = "slide-*"
 group = "slide"
 [[arms]]
 preset = "floor_components"
-set = ["resampler=systematic,residual"]
+set = ["resampler=systematic,residual", "proposal.completer=extrude"]
 [smoke]
 seeds = 3
 """
@@ -55,8 +56,8 @@ def test_a_finished_study_repeats_no_run(folder, tmp_path, capsys):
     rows = metrics(tmp_path / "out")
     assert len(rows) == 2 * 2 * 2 * 3
     assert {r["arm"] for r in rows} == {
-        "floor_components resampler=systematic",
-        "floor_components resampler=residual",
+        f"floor_components resampler=systematic {LIGHT}",
+        f"floor_components resampler=residual {LIGHT}",
     }
     assert {(r["scene"], r["family"]) for r in rows} == {("slide-0", "slide"), ("slide-1", "slide")}
     made = {p: p.stat().st_mtime_ns for p in (tmp_path / "out" / "runs").rglob("result.json")}
@@ -130,8 +131,8 @@ def test_a_worker_with_other_code_refuses():
 
 def test_arms_that_use_the_ground_truth_are_marked(folder, tmp_path):
     data = {"name": "s", "folder": folder, "scenes": [{"recordings": "slide-0"}], "seeds": [0]}
-    arms = [{"preset": "mst"}]
-    arms.append({"name": "oracle", "preset": "mst", "set": ['update.evidence=["true_quality"]']})
+    arms = [{"preset": "mst", "set": ["n_proposed=2"]}]
+    arms.append({"name": "oracle", "preset": "mst", "set": ["n_proposed=2", 'update.evidence=["true_quality"]']})
     result = run_here(study_of({**data, "arms": arms}), tmp_path / "out", cache=tmp_path / "cache")
     assert result.failed == ()
     assert result.folder.truth_users == {"oracle": ["TrueQuality"]}
@@ -237,7 +238,8 @@ def own(folder, tmp_path, monkeypatch):
     """The data of a study, in a working folder with own metrics."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "own.py").write_text(OWN)
-    arms = [{"preset": "floor_components"}, {"preset": "floor_components", "name": "one", "set": ["n=1"]}]
+    light = {"preset": "floor_components", "set": [LIGHT]}
+    arms = [{**light, "name": "floor_components"}, {**light, "name": "one", "set": [LIGHT, "n=1"]}]
     return {"name": "s", "folder": folder, "scenes": [{"recordings": "slide-*"}], "seeds": [0], "arms": arms}
 
 
@@ -307,16 +309,21 @@ def test_a_wrong_metric_is_an_error_before_any_run(own, tmp_path, metric, error)
     assert not (tmp_path / "out").exists()
 
 
-def test_a_study_runs_on_a_cluster(folder, tmp_path, monkeypatch):
+@pytest.mark.parametrize("n_recordings", [1, pytest.param(2, marks=pytest.mark.nightly)])
+def test_a_study_runs_on_a_cluster(folder, tmp_path, n_recordings):
     """A local cluster of dask in this process; the runs are in worker processes all the same."""
     distributed = pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
-    seen, study = [], load_study(folder / "base.toml", smoke=True)
-    with distributed.LocalCluster(2, processes=False, threads_per_worker=1, dashboard_address=None) as cluster:
+    scenes = tuple(SceneEntry(recordings=(f"slide-{k}",)) for k in range(n_recordings))
+    seen, study = [], load_study(folder / "base.toml", smoke=True).model_copy(update={"scenes": scenes})
+    with distributed.LocalCluster(
+        n_recordings, processes=False, threads_per_worker=1, dashboard_address=None
+    ) as cluster:
         address, options = cluster.scheduler_address, {"cache": tmp_path, "progress": seen.append}
         found = run_study(study, tmp_path / "out", cluster=address, **options)
-    assert (found.done, found.failed) == (4, ())
-    assert [one.name for one in seen if one.name] == [one.name for one in seen][1:] and seen[-1].done == 4
-    assert len(list((tmp_path / "out" / "logs").iterdir())) == 2  # one for each recording
+    assert (found.done, found.failed) == (2 * n_recordings, ())
+    assert [one.name for one in seen if one.name] == [one.name for one in seen][1:]
+    assert seen[-1].done == 2 * n_recordings
+    assert len(list((tmp_path / "out" / "logs").iterdir())) == n_recordings  # one for each recording
     run_here(study, tmp_path / "here", cache=tmp_path)
     assert metrics(tmp_path / "out") == metrics(tmp_path / "here")
 

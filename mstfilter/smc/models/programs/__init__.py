@@ -4,7 +4,8 @@
 >>> def ar1(previous, y):
 ...     x = sample("x", Normal(0.0, 1.0) if previous is None else Normal(0.9 * previous["x"], 0.5))
 ...     observe("y", Normal(x, 1.0), y)
->>> state, infos = Program(ar1).bootstrap(n=1000).run([0.3, -0.1, 0.8], seed=0)
+>>> sites, ys = Program(ar1).simulate(50, seed=1)
+>>> state, infos = Program(ar1).bootstrap(n=1000).run(ys, seed=0)
 >>> state.population.particles["x"].shape
 (1000,)
 

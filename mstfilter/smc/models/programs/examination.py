@@ -51,6 +51,9 @@ _REPEAT = (
     "return values that the next step needs; do not keep them in global variables, closures or the observation",
 )
 
+#: Particles among which those with middle values are sought: enough to meet rare branches, and quickly sorted.
+_SORTED = 500
+
 Run = Callable[..., ProgramRun]  #: of a function, a handler, the previous particles, an observation and n
 
 
@@ -128,8 +131,10 @@ def _groups(run: ProgramRun, thorough: bool) -> list[np.ndarray]:
     """
     numbers = next((v for v in run.values.values() if v.dtype.kind == "f" and v.size), None)
     column = np.arange(run.n) if numbers is None else numbers.reshape(run.n, -1)[:, 0]
-    order, size = np.argsort(column), max(run.n // 3, 1)
-    middle = [order[size : run.n - size][::-1]] if run.n > 5 else []
+    sorted_of = spread_rows(run.n, run.n if thorough else min(run.n, _SORTED))
+    order = sorted_of[column[sorted_of].argsort()]
+    size = max(len(order) // 3, 1)
+    middle = [order[size : len(order) - size][::-1]] if len(order) > 5 else []
     ends = [order[:size], order[: -size - 1 : -1]] if thorough or not middle else []
     return [_group(run, part) for part in middle + ends]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -22,9 +22,11 @@ from mstfilter.smc.models.programs.handlers import (
     GuideHandler,
     ReplayHandler,
     SampleHandler,
+    SimulateHandler,
     SiteHandler,
 )
 from mstfilter.smc.models.programs.sites import ProgramRun, active_run
+from mstfilter.smc.models.simulation import simulate_steps
 from mstfilter.smc.population import Particles, Population
 
 Model = Callable[..., Any]
@@ -54,9 +56,57 @@ class Program:
         """
         return self._filter(guide, n, components)
 
+    def simulate(self, n_steps: int, seed: int = 0, inputs: Iterable[Any] | None = None) -> tuple[Particles, Any]:
+        """Draw values of all sites and observations at T steps, as `StateSpaceModel.simulate` does.
+
+        The program gets the observation None, and each `observe` of a value None draws one. So with one `observe`, a
+        step gives its value. If there are several, a step gives a mapping from their names to values. A program that
+        reads entries of the observation, such as ``y["range"]`` or ``y[0]``, gives a mapping or a tuple with these
+        entries, if each of them is observed once and in the order in which they are read.
+        """
+
+        def step(rng: np.random.Generator, t: int, u: Any, x: Any) -> tuple[Any, Any]:
+            model, previous = ProgramInitial(self.model).at_step(t, u).model, x
+            asked: Any = None
+            try:
+                handler = SimulateHandler(rng)
+                run = run_once(model, handler, previous, None, 2)
+            except InputError:
+                handler, asked = SimulateHandler(rng), _Entries()
+                run = run_once(model, handler, previous, asked, 2)
+            return {**run.values, **run.returned}, _observation(handler.observed, asked)
+
+        return simulate_steps(step, n_steps, seed, inputs)
+
     def _filter(self, guide: Model | None, n: int, components: dict[str, Any]) -> ParticleFilter:
         initial, transition = ProgramInitial(self.model, guide), ProgramTransition(self.model, guide)
         return ParticleFilter(initial=initial, transition=transition, n=n, **components)
+
+
+class _Entries(dict[Any, None]):
+    """An observation whose entries are all missing. It holds the keys that were read, in their order."""
+
+    def __missing__(self, key: Any) -> None:
+        self[key] = None
+
+
+def _observation(observed: Mapping[str, Any], asked: _Entries | None) -> Any:
+    """The observation of a step of a simulated program, of values in the order in which they were drawn."""
+    values = list(observed.values())
+    if not values:
+        raise InputError(
+            "the program observes nothing if its observation is None, so it cannot be simulated",
+            "call observe with the value None where the observation is missing",
+        )
+    if asked is None:
+        return values[0] if len(values) == 1 else dict(observed)
+    if len(asked) != len(values):
+        raise InputError(
+            f"the program reads the entries {list(asked)} of the observation and observes {list(observed)}, so it "
+            "cannot be simulated",
+            "observe each entry once, or accept the observation None",
+        )
+    return tuple(values) if list(asked) == list(range(len(values))) else dict(zip(asked, values, strict=True))
 
 
 @dataclass(frozen=True)

@@ -39,8 +39,8 @@ class SiteHandler(ABC):
     def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
         """Values (size, ...) of a site, and the change of the log weights (None: no change)."""
 
-    def missing(self, name: str, distribution: Any, size: int) -> None:  # noqa: B027 (optional)
-        """Called for an observation whose value is None."""
+    def missing(self, site: Site) -> None:  # noqa: B027 (optional)
+        """Called for an observation whose value is None, with its name, distribution and particles."""
 
     def finish(self, values: dict[str, np.ndarray]) -> None:  # noqa: B027 (optional)
         """Called at the end of a run of the program, with the values of all sites."""
@@ -61,10 +61,12 @@ class SimulateHandler(SampleHandler):
 
     def __init__(self, rng: np.random.Generator) -> None:
         super().__init__(rng)
-        self.observed: dict[str, np.ndarray] = {}
+        self.observed: dict[str, Any] = {}  #: observation of the first particle, by name
 
-    def missing(self, name: str, distribution: Any, size: int) -> None:
-        self.observed[name] = distribution.sample(self.rng, size)
+    def missing(self, site: Site) -> None:
+        drawn = site.distribution.sample(self.rng, site.size)
+        if site.rows is None or 0 in site.rows[:1]:
+            self.observed[site.name] = drawn[0]
 
 
 class GuideHandler(SiteHandler):

@@ -160,7 +160,7 @@ class ProgramRun:
         if not self.handler.observes:
             raise InputError("a guide does not observe, the model weights the particles", "remove it from the guide")
         if value is None:
-            self.handler.missing(name, as_distribution(distribution), self._size)
+            self.handler.missing(Site(name, as_distribution(distribution), self._size, self._rows))
         else:
             distribution = as_distribution(distribution)
             found: tuple[int, ...] = () if isinstance(value, float) else np.shape(value)

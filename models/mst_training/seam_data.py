@@ -1,0 +1,164 @@
+"""Samples for the judge of seams: divisions of regions in simulated images, and which of them separate objects.
+
+>>> samples = SeamSamples.of_scene(seed=0, index=3)             # always the same
+>>> samples.x.shape, samples.strip.shape, samples.purity
+
+Half of the scenes ask the question: in `row`, `stack` and `pack`, things that look like several objects are one as
+often as not. The others are `s1` to `s3`. Cameras and sensors are drawn at random, sizes and textures are those for
+tuning. The regions are those that `SeamTree` examines in the tree `border`, and below them the sides of the best
+division, or of a random one. Most regions that plainly are one object are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+
+from mst_training.scenes import Samples, displaced
+from mst_training.shapes import TRAINED
+from mstfilter.base.errors import InputError
+from mstfilter.lab.simulation import scene_family
+from mstfilter.lab.simulation.recorder import POSE_TOLERANCE, SimulatedScene
+from mstfilter.lab.simulation.renderer import Renderer
+from mstfilter.lab.simulation.sensor import SENSORS, colour_reading
+from mstfilter.mst.segmentation import Agglomeration, BorderTree, ColourDepthBoundary, ObjectRule, pair_log_odds
+from mstfilter.mst.segmentation.divisions import Division, SeamImage, divisions
+from mstfilter.mst.segmentation.seam_measures import SeamMeasures
+from mstfilter.mst.segmentation.seams import BaseTree, least_examined
+from mstfilter.scene import Camera, Frame, VoxelGrid, look_at, scene_cache
+
+_FAMILIES = {"row": 0.25, "stack": 0.25, "pack": 0.12, "s1": 0.12, "s2": 0.16, "s3": 0.10}
+_GROUPED = ("row", "stack", "pack")
+_OWN_CAMERA = 0.35  # share of the images that the camera of the family takes
+_N_VIEWS = 3
+_FIRST_SEED = 1_000_000  # of scenes; the studies use smaller ones
+#: An object counts if so many of its pixels are in a region, and such a share of the region or of its own pixels.
+_LEAST_PIXELS, _LEAST_SHARE, _LEAST_OWN = 120, 0.15, 0.4
+_WHOLE = 0.7  # share of each object that must be on one side of a division that separates objects
+_PLAIN = {True: 0.85, False: 0.65}  # share of the regions of one object that are used, in scenes with groups or not
+_MOST_DEPTH = 3
+_PURE, _AT_RANDOM = 0.93, 0.15  # divisions that are followed: such pure ones, and this share of the others
+
+
+@dataclass(frozen=True, eq=False)
+class SeamSamples(Samples):
+    """Divisions of many regions, one after the other."""
+
+    x: np.ndarray  #: (k, f) float32, `SeamMeasures.describe`
+    strip: np.ndarray  #: (k, c, 64, 24) uint8
+    #: (k,) float32, share of the pixels on the right side if each object is given to one side; 0 for a division that
+    #: leaves all objects on one side
+    purity: np.ndarray
+    region: np.ndarray  #: (k,) int64, number of the region
+    objects: np.ndarray  #: (k,) int32, number of objects of the region
+    depth: np.ndarray  #: (k,) int32, number of divisions above the region
+    grouped: np.ndarray  #: (k,) bool, whether the scene has groups
+
+    @classmethod
+    def of_scene(cls, seed: int, index: int, kinds: tuple[str, ...] = TRAINED) -> Self:
+        """The samples of scene number `index`; `kinds` are not used."""
+        for attempt in range(20):
+            rng = np.random.default_rng([seed, index, attempt])
+            try:
+                rows = [*_rows(rng, _FIRST_SEED * (1 + seed) + 20 * index + attempt)]
+            except InputError:  # the objects do not fit
+                continue
+            finally:
+                scene_cache.clear()
+            if rows:
+                numbered = [
+                    (*row[:3], np.full(len(row[0]), 1000 * index + k), *(np.full(len(row[0]), v) for v in row[3:]))
+                    for k, row in enumerate(rows)
+                ]
+                return cls(*(np.concatenate(column) for column in zip(*numbered, strict=True)))
+        raise InputError(f"no scene number {index} could be made")
+
+
+_Row = tuple[np.ndarray, np.ndarray, np.ndarray, int, int, bool]
+
+
+def _rows(rng: np.random.Generator, seed: int) -> Iterator[_Row]:
+    """The regions of some images of a scene."""
+    name = str(rng.choice([*_FAMILIES], p=[*_FAMILIES.values()]))
+    sensor: Any = str(rng.choice(["xtion", "xtion", "xtion", *SENSORS]))
+    family = replace(scene_family(name), n_actions=0, catalogue="tuning", sensor=sensor, arm=False, one_share=0.5)
+    scene = SimulatedScene(family, seed)
+    for _ in range(_N_VIEWS):
+        camera = family.camera() if rng.uniform() < _OWN_CAMERA else _camera(rng, scene)
+        view = Renderer(scene.world, scene.objects.skins, scene.room, camera, True, POSE_TOLERANCE).render()
+        materials = (view.reflectance, view.shine) if scene.sensor.sees_materials else ()
+        depth = scene.sensor.read(rng, view.depth, view.slant, *materials)
+        rgb = colour_reading(rng, view.colour * scene.room.exposure)
+        measured = displaced(rng, camera) if rng.uniform() < 0.6 else camera
+        try:
+            yield from _regions(rng, Frame(rgb, depth, measured), scene.grid, view.instance, name in _GROUPED)
+        except InputError:  # the view shows no table
+            continue
+
+
+def _camera(rng: np.random.Generator, scene: SimulatedScene) -> Camera:
+    at = scene.world.poses()[:, :3, 3]
+    inside = (np.abs(at[:, :2]) < 0.45).all(axis=1) & (at[:, 2] > 0)
+    target = np.append(at[inside, :2].mean(axis=0), 0.05) + rng.normal(0.0, 0.03, 3)
+    azimuth, raised, far = rng.uniform(0, 2 * np.pi), np.deg2rad(rng.uniform(18, 65)), rng.uniform(0.55, 1.1)
+    away = np.array([np.cos(raised) * np.cos(azimuth), np.cos(raised) * np.sin(azimuth), np.sin(raised)])
+    focal = scene.sensor.focal
+    return Camera.from_intrinsics(focal, focal, 319.5, 239.5, 640, 480, look_at(target + far * away, target))
+
+
+def _regions(
+    rng: np.random.Generator, frame: Frame, grid: VoxelGrid, instance: np.ndarray, grouped: bool
+) -> Iterator[_Row]:
+    """The regions of one image with their divisions."""
+    tree = BorderTree()
+    found = ObjectRule().foreground(frame, grid)
+    boundary = ColourDepthBoundary().boundary(found.frame)
+    seen = tree.look(found.frame)
+    regions = tree.regions(boundary, found.frame, found.pixels, seen)
+    growing = Agglomeration(regions, pair_log_odds(tree.model()[0], tree.correction(), 1.0))
+    growing.merge_all()
+    base = BaseTree(regions.image, len(regions.sums), growing.merges)
+    image = SeamImage.of(found.frame, boundary, seen)
+    measures = SeamMeasures.of(image, regions.image > 0)
+    flat = instance.ravel()
+    visible = np.bincount(flat[regions.image.ravel() > 0], minlength=256)
+    for node in base.uncertain():
+        todo = [(*base.region(node), 0)]
+        while todo:
+            pixels, parts, depth = todo.pop()
+            if len(pixels) < least_examined(flat.size) or not (divided := divisions(image, pixels, parts)):
+                continue
+            purity, n = _purity(flat[pixels], divided, visible)
+            if n == 0 or (n == 1 and depth == 0 and rng.uniform() > _PLAIN[grouped]):
+                continue
+            yield (*measures.describe(pixels, divided), purity, n, depth, grouped)
+            if depth < _MOST_DEPTH:
+                best = int(purity.argmax())
+                if n > 1 and purity[best] > _PURE:
+                    side = divided[best].side
+                elif rng.uniform() < _AT_RANDOM:
+                    side = divided[int(rng.integers(len(divided)))].side
+                else:
+                    continue
+                todo += [(pixels[one], [part[one] for part in parts], depth + 1) for one in (side, ~side)]
+
+
+def _purity(instance: np.ndarray, divided: list[Division], visible: np.ndarray) -> tuple[np.ndarray, int]:
+    """`SeamSamples.purity` (k,) of divisions of a region with these objects (n,), and the number of its objects.
+
+    `visible` has the number of pixels of each object in the image.
+    """
+    sizes = np.bincount(instance, minlength=256)
+    sizes[0] = 0
+    enough = (sizes > _LEAST_SHARE * sizes.sum()) | (sizes > _LEAST_OWN * visible)
+    large = np.flatnonzero((sizes > _LEAST_PIXELS) & enough)
+    purity = np.zeros(len(divided), np.float32)
+    for k, division in enumerate(divided):
+        first = np.array([division.side[instance == one].mean() for one in large])
+        share = np.maximum(first, 1 - first)
+        if len(large) > 1 and 0 < (first > 0.5).sum() < len(large) and share.min() > _WHOLE:
+            purity[k] = share @ sizes[large] / sizes[large].sum()
+    return purity, len(large)

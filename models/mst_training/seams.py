@@ -1,0 +1,192 @@
+"""Training of the judge of seams.
+
+>>> run_training(SeamsTraining.recipe("cpu"), "seam-model")
+
+A batch is a set of regions. If a region is one object, its loss is -log P(one); else it is -log of the probability of
+all divisions that separate its objects cleanly, or -log(1 - P(one)) if there is none. So the judge need not choose
+among divisions that are equally good. Strips are mirrored, and their colours are weakened or taken away. At the end,
+scale and shift of the scores are fitted to the validation samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from torch import Tensor, nn
+
+from mst_training.loop import Training
+from mst_training.scenes import Samples
+from mst_training.seam_data import SeamSamples
+from mstfilter.mst.segmentation.seam_measures import STRIP_CHANNELS
+from mstfilter.mst.segmentation.seam_network import INPUTS, SEAM_ARCHITECTURE, SeamNet, decoded
+from mstfilter.scoring.forecasts import ForecastTable
+
+_CLEAN, _SLACK = 0.95, 0.02  # least purity of a clean division, and the most that it is less pure than the best
+_COLOURS = slice(STRIP_CHANNELS.index("lightness"), STRIP_CHANNELS.index("b") + 1)
+_TURNED = [STRIP_CHANNELS.index(name) for name in ("slope across", "distance")]  # change their sign in a mirror
+
+
+@dataclass(frozen=True)
+class SeamsTraining(Training):
+    """Settings of the training of the judge. A scene gives about 20 regions with a dozen divisions each."""
+
+    n_scenes: int = 600
+    n_validation: int = 40
+    n_test: int = 60
+    width: int = 24
+    steps: int = 6000
+    batch: int = 24  #: regions
+    average: float = 0.995
+    half_precision: bool = False
+    colour_dropout: float = 0.15  #: share of the batches without colours
+
+    recipes: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "cpu": {},
+        "gpu": {"n_scenes": 6000, "steps": 60_000, "batch": 64},
+        "smoke": {"n_scenes": 2, "n_validation": 1, "n_test": 1, "width": 8, "steps": 40, "average": 0.9},
+    }
+    architecture: ClassVar[str] = SEAM_ARCHITECTURE
+    samples: ClassVar[type[Samples]] = SeamSamples
+    losses: ClassVar[tuple[str, ...]] = ("loss",)
+
+    def networks(self) -> dict[str, nn.Module]:
+        return {"net": SeamNet(self.width)}
+
+    def batches(self, samples: SeamSamples, first: int, last: int) -> Iterator[tuple[Tensor, ...]]:
+        """Inputs, strips, purities, number of the region of each division, and the objects of each region."""
+        rows = _by_region(samples)
+        for step, chosen in self.order(len(rows), first, last):
+            rng = np.random.default_rng([self.seed, 2, step])
+            x, strips, *others = _batch(samples, [rows[k] for k in chosen.tolist()])
+            if rng.uniform() < 0.5:
+                strips = strips.flip(3)[:, [1, 0, *range(2, len(STRIP_CHANNELS))]]
+                strips[:, _TURNED] *= -1
+            strips[:, _COLOURS] *= 0.0 if rng.uniform() < self.colour_dropout else float(rng.uniform(0.5, 1.2))
+            yield x, strips, *others
+
+    def loss(
+        self, networks: Mapping[str, Any], step: int, batch: Sequence[Tensor]
+    ) -> tuple[Tensor, tuple[float, ...]]:
+        """The mean loss of the regions."""
+        x, strips, *truth = batch
+        net = networks["net"]
+        if step == 0:  # the inputs are standardised by the first batch
+            net.mean.copy_(x.mean(0))
+            net.scale.copy_(x.std(0) + 0.05)
+        total = region_losses(net(x, strips), *truth)[0].mean()
+        return total, (float(total.detach()),)
+
+    def validate(self, net: SeamNet, samples: SeamSamples, device: torch.device) -> dict[str, float]:
+        return _figures(_judged(net, samples, device))
+
+    def finish(
+        self, net: SeamNet, validation: SeamSamples, test: SeamSamples, device: torch.device
+    ) -> tuple[dict[str, Any], dict[str, float], list[dict[str, Any]]]:
+        scale, shift = _calibrated(_judged(net, validation, device))
+        judged = _judged(net, test, device)
+        scores, purity, region, objects = judged
+        calibrated = (scale * scores + shift, purity, region, objects)
+        table: list[dict[str, Any]] = []
+        grouped = np.array([test.grouped[rows[0]] for rows in _by_region(test)])
+        for name, chosen in (("all", grouped >= 0), ("groups", grouped), ("other scenes", ~grouped)):
+            table.append({"scenes": name, **_figures(calibrated, torch.from_numpy(chosen))})
+        described = {
+            "network": {"channels": [*INPUTS, *STRIP_CHANNELS], "width": self.width},
+            "calibration": {"scale": scale, "shift": shift},
+        }
+        return described, dict(list(table[0].items())[1:]), table
+
+
+def region_losses(scores: Tensor, purity: Tensor, region: Tensor, objects: Tensor) -> tuple[Tensor, Tensor]:
+    """The losses (r,) of regions and their log P(one), from the scores (k,) of all divisions.
+
+    `purity` (k,), number of the `region` (k,) of each division, and number of `objects` (r,) of each region.
+    """
+    n = len(objects)
+    zero = torch.zeros(n, dtype=scores.dtype, device=scores.device)
+    top = zero.scatter_reduce(0, region, scores.detach(), "amax")  # at least the 0 of "one"
+    odds = torch.exp(scores - top[region])
+    several = zero.index_add(0, region, odds)
+    best = zero.scatter_reduce(0, region, purity.to(scores.dtype), "amax")
+    clean = (purity >= _CLEAN) & (purity >= best[region] - _SLACK)
+    right = zero.index_add(0, region, odds * clean)
+    right = torch.where(right > 0, right, several)
+    log_total = torch.log(several + torch.exp(-top)) + top
+    log_one = -log_total
+    log_right = torch.log(right + 1e-30) + top - log_total
+    return -torch.where(objects < 2, log_one, log_right), log_one
+
+
+def _by_region(samples: SeamSamples) -> list[np.ndarray]:
+    """The rows of each region.
+
+    The side of a division may hold a piece of the other object that no further division separates. Such a region is
+    neither one object nor two, and is left out.
+    """
+    order = np.argsort(samples.region, kind="stable")
+    starts = np.unique(samples.region[order], return_index=True)[1]
+    rows = np.split(order, starts[1:])
+    return [
+        one
+        for one in rows
+        if samples.depth[one[0]] == 0 or samples.objects[one[0]] < 2 or samples.purity[one].max() >= _CLEAN
+    ]
+
+
+def _batch(samples: SeamSamples, regions: list[np.ndarray]) -> tuple[Tensor, ...]:
+    rows = np.concatenate(regions)
+    of = np.repeat(np.arange(len(regions)), [len(one) for one in regions])
+    first = [one[0] for one in regions]
+    x = torch.from_numpy(np.nan_to_num(samples.x[rows]))
+    return (
+        *(x, decoded(samples.strip[rows]), torch.from_numpy(samples.purity[rows])),
+        *(torch.from_numpy(of), torch.from_numpy(samples.objects[first].astype(np.int64))),
+    )
+
+
+_Judged = tuple[Tensor, Tensor, Tensor, Tensor]  # scores, purity, region, objects: see `region_losses`
+
+
+def _judged(net: SeamNet, samples: SeamSamples, device: torch.device) -> _Judged:
+    """The scores of all divisions, region by region."""
+    rows = _by_region(samples)
+    net.eval()
+    found: list[tuple[Tensor, ...]] = []
+    with torch.inference_mode():
+        for k in range(0, len(rows), 64):
+            x, strips, purity, of, objects = _batch(samples, rows[k : k + 64])
+            found.append((net(x.to(device), strips.to(device)).cpu(), purity, of + k, objects))
+    net.train()
+    scores, purity, of, objects = (torch.cat(column) for column in zip(*found, strict=True))
+    return scores, purity, of, objects
+
+
+def _figures(judged: _Judged, chosen: Tensor | None = None) -> dict[str, float]:
+    """Loss, and forecasts of "one object" of the chosen (r,) regions."""
+    losses, log_one = region_losses(*judged)
+    keep = torch.ones(len(losses), dtype=torch.bool) if chosen is None else chosen
+    p, one = log_one[keep].exp().double().numpy(), (judged[3][keep] < 2).double().numpy()
+    table = ForecastTable.of(p, one, np.ones(len(p)))
+    return {
+        "regions": float(keep.sum()),
+        "region_loss": float(losses[keep].mean()),
+        "one_log_loss": table.log_loss(0.001),
+        "one_calibration_error": table.reliability().error,
+        "one_share": float(one.mean()),
+    }
+
+
+def _calibrated(judged: _Judged) -> tuple[float, float]:
+    """Scale and shift of the scores with the least mean loss."""
+    scores, *truth = (part.double() if part.is_floating_point() else part for part in judged)
+
+    def loss(values: np.ndarray) -> float:
+        return float(region_losses(values[0] * scores + values[1], *truth)[0].mean())
+
+    scale, shift = minimize(loss, (1.0, 0.0), method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-6}).x
+    return float(scale), float(shift)

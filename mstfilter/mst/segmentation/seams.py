@@ -1,0 +1,250 @@
+"""A segmentation tree in which both readings of an ambiguous region exist: one object, or two that touch.
+
+A tree of merged regions follows the borders that can be seen. Two boxes side by side may show none, so such a tree
+has no node for each of them, and no sample of it can be right if they are two. `SeamTree` therefore looks again at
+the regions that its base tree joins, or divides with little certainty. It collects the ways to divide each
+(`mstfilter.mst.segmentation.divisions`), and a small network, the judge, gives the probabilities of "one object" and
+of each division. The most probable division becomes the first of the tree below this region, with the log odds of
+"not one" as its odds; the two sides are then examined in the same way.
+
+>>> tree = SeamTree().build(boundary, frame)
+>>> w = MergeLogOdds().values(tree, frame)
+
+The judge was trained on scenes in which things that look like two objects are one as often as not. How often that is
+so where the filter is used is a prior, the field `one_share`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from math import log
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+
+from mstfilter.base.errors import InputError
+from mstfilter.base.fields import Bounds, Share
+from mstfilter.mst.segmentation.divisions import Division, SeamImage, divisions
+from mstfilter.mst.segmentation.learned_tree import Agglomeration, BorderTree, pair_log_odds, tree_of_merges
+from mstfilter.mst.segmentation.regions import Regions
+from mstfilter.mst.segmentation.seam_measures import SeamMeasures
+from mstfilter.mst.segmentation.tree import Tree, TreeBuilder
+from mstfilter.scene import Frame, pixels_above_table, scaled_area, scaled_length
+
+if TYPE_CHECKING:
+    from mstfilter.mst.segmentation.seam_network import SeamNetwork
+
+_CERTAIN = 3.0  # log odds: merges of the base tree above this stay as they are
+_KNOWN = -6.0  # log odds: merges of the base tree below this are no divisions to examine
+_SURE = -5.0  # most log odds of merges inside a region that is judged to be one object
+_LEAST_PIXELS = 400  # of a region that is examined, in an image of 640 x 480
+_MOST_DEPTH = 4  # divisions of a region that follow one another
+_FOLLOWED = -1.5  # log odds of a division above which its sides are examined
+_MOST_MERGES = 8  # of the base tree that are examined in a region
+
+
+@dataclass(frozen=True)
+class SeamTree(TreeBuilder):
+    """A tree whose uncertain regions are divided along seams.
+
+    Parameters
+    ----------
+    base : BorderTree
+        The tree whose regions are examined.
+    weights : str
+        Name of a trained model of the package, or the path of a model folder: the judge.
+    one_share : float
+        Prior probability that what may be one object or several is one. The judge was trained where it is 0.5.
+    least : float
+        A region is divided in the tree if the probability that it is several objects is at least this.
+    """
+
+    base: BorderTree = field(default_factory=BorderTree)
+    weights: str = "seams"
+    one_share: Annotated[float, Bounds(above=0, below=1)] = 0.5
+    least: Share = 0.02
+
+    @property
+    def bound_key(self) -> bytes:
+        """Hash of the models. The hash is part of the keys of cached values."""
+        return self.base.bound_key + self._judge().key.encode()
+
+    def build(self, boundary: np.ndarray, frame: Frame | None = None, pixels: np.ndarray | None = None) -> Tree:
+        """The tree of merged regions with examined seams; `odds` as in `MergedTree.build`."""
+        if frame is None:
+            raise InputError(
+                f"{type(self).__name__} needs the frame of the boundary map", "tree.build(boundary, frame)"
+            )
+        pixels = pixels_above_table(frame) if pixels is None else pixels
+        seen = self.base.look(frame)
+        regions = self.base.regions(boundary, frame, pixels, seen)
+        log_odds = pair_log_odds(self.base.model()[0], self.base.correction(), scaled_length(1, boundary.shape[1]))
+        growing = Agglomeration(regions, log_odds)
+        growing.merge_all()
+        return _Examination(self, self._judge(), SeamImage.of(frame, boundary, seen), regions, growing.merges).tree()
+
+    def _judge(self) -> SeamNetwork:
+        from mstfilter.mst.segmentation.seam_network import load_seam_network
+
+        return load_seam_network(self.weights)
+
+
+def least_examined(size: int) -> float:
+    """Pixels of the smallest region that is examined, in an image of `size` pixels."""
+    return scaled_area(_LEAST_PIXELS, size)
+
+
+@dataclass(frozen=True, eq=False)
+class BaseTree:
+    """A tree of merges: the regions below each node, and its merge."""
+
+    image: np.ndarray  #: (H, W) region of every pixel, 0 is the table
+    n: int  #: number of regions
+    merges: list[tuple[int, int, float]]
+
+    def top(self) -> list[int]:
+        """The nodes that no merge joins."""
+        joined = {child for a, b, _ in self.merges for child in (a, b)}
+        return [node for node in range(1, self.n + len(self.merges)) if node not in joined]
+
+    def uncertain(self) -> list[int]:
+        """The largest nodes whose merge is not sure to join different objects: the regions that are examined."""
+        found, stack = [], self.top()
+        while stack:
+            merge = self.merge_of(node := stack.pop())
+            if merge is not None and merge[2] > _CERTAIN:
+                stack += merge[:2]
+            else:
+                found.append(node)
+        return sorted(found)
+
+    def region(self, node: int) -> tuple[np.ndarray, list[np.ndarray]]:
+        """The flat pixels (n,) below a node, and the parts (n,) bool of it that the tree knows."""
+        flat = self.image.ravel()
+        pixels = np.flatnonzero(self.regions_of(node)[flat])
+        return pixels, [part[flat[pixels]] for part in self.parts(node)]
+
+    def merge_of(self, node: int) -> tuple[int, int, float] | None:
+        """The merge that makes a node, None for a region."""
+        return self.merges[node - self.n] if node >= self.n else None
+
+    def regions_of(self, node: int) -> np.ndarray:
+        """(n,) bool: the regions below a node."""
+        found = np.zeros(self.n, bool)
+        stack = [node]
+        while stack:
+            one = stack.pop()
+            if one < self.n:
+                found[one] = True
+            else:
+                stack += self.merges[one - self.n][:2]
+        return found
+
+    def parts(self, node: int) -> list[np.ndarray]:
+        """Regions (n,) bool on one side of the merges below a node that may divide objects, most divided first."""
+        found, stack = [], [node]
+        while stack:
+            if (merge := self.merge_of(stack.pop())) is not None:
+                found.append(merge)
+                stack += merge[:2]
+        found = sorted(found, key=lambda merge: -merge[2])[:_MOST_MERGES]
+        return [self.regions_of(child) for *children, odds in found if odds >= _KNOWN for child in children]
+
+
+class _Examination:
+    """Builds the tree of one image."""
+
+    def __init__(
+        self,
+        builder: SeamTree,
+        judge: SeamNetwork,
+        image: SeamImage,
+        regions: Regions,
+        merges: list[tuple[int, int, float]],
+    ) -> None:
+        self.builder, self.judge, self.image = builder, judge, image
+        self.base = BaseTree(regions.image, len(regions.sums), merges)
+        self.uncertain = frozenset(self.base.uncertain())
+        self.flat = regions.image.ravel()
+        self.measures = SeamMeasures.of(image, regions.image > 0)
+        self.prior = log(builder.one_share / (1 - builder.one_share))
+        self.least = least_examined(self.flat.size)
+        self.leaves = np.zeros_like(self.flat)  # of the new tree
+        self.n_leaves = 1
+        self.joins: list[tuple[tuple[str, int], tuple[str, int], float]] = []
+
+    def tree(self) -> Tree:
+        """The tree."""
+        for node in self.base.top():
+            self._upper(node)
+        n = self.n_leaves
+        number = {"leaf": 0, "join": n}
+        merges = [(number[a[0]] + a[1], number[b[0]] + b[1], odds) for a, b, odds in self.joins]
+        return tree_of_merges(self.leaves.reshape(self.base.image.shape), n, merges)
+
+    def _join(self, a: tuple[str, int], b: tuple[str, int], odds: float) -> tuple[str, int]:
+        self.joins.append((a, b, odds))
+        return "join", len(self.joins) - 1
+
+    def _leaf(self, pixels: np.ndarray) -> tuple[str, int]:
+        self.leaves[pixels] = self.n_leaves
+        self.n_leaves += 1
+        return "leaf", self.n_leaves - 1
+
+    def _upper(self, node: int) -> tuple[str, int]:
+        if node in self.uncertain:
+            return self._examined(node, *self.base.region(node), depth=0)
+        merge = self.base.merge_of(node)
+        assert merge is not None
+        a, b, odds = merge
+        return self._join(self._upper(a), self._upper(b), odds)
+
+    def _examined(self, node: int, pixels: np.ndarray, parts: Sequence[np.ndarray], depth: int) -> tuple[str, int]:
+        """The subtree of some pixels (n,) below a node of the base tree; `parts` are those of `divisions`."""
+        if depth <= _MOST_DEPTH and len(pixels) >= self.least:
+            found = divisions(self.image, pixels, parts)
+            log_odds, best = self._judged(pixels, found)
+            if log_odds > np.log(self.builder.least / (1 - self.builder.least)):
+                # The sides of an improbable division are seldom in a sample, so they are not examined.
+                depth = depth + 1 if log_odds > _FOLLOWED else _MOST_DEPTH + 1
+                side = found[best].side
+                below = [
+                    self._examined(node, pixels[one], [part[one] for part in parts], depth) for one in (side, ~side)
+                ]
+                return self._join(below[0], below[1], float(log_odds))
+        return self._kept(node, pixels)
+
+    def _judged(self, pixels: np.ndarray, found: list[Division]) -> tuple[float, int]:
+        """Log odds of "several objects" against "one", and the index of the most probable division."""
+        if not found:
+            return -np.inf, -1
+        scores = self.judge.scores(*self.measures.describe(pixels, found))
+        return float(np.logaddexp.reduce(scores)) - self.prior, int(scores.argmax())
+
+    def _kept(self, node: int, pixels: np.ndarray) -> tuple[str, int]:
+        """The base tree below a node, restricted to some pixels. Without merges that divide objects."""
+        regions = self.flat[pixels]
+        order = np.argsort(regions, kind="stable")
+        names, start = np.unique(regions[order], return_index=True)
+        leaf = {
+            name: self._leaf(pixels[chosen])
+            for name, chosen in zip(names.tolist(), np.split(order, start[1:]), strict=True)
+        }
+        made: dict[int, tuple[str, int] | None] = {}
+        below, stack = [], [node]
+        while stack:
+            one = stack.pop()
+            below.append(one)
+            if (merge := self.base.merge_of(one)) is not None:
+                stack += merge[:2]
+        for one in reversed(below):  # children first
+            merge = self.base.merge_of(one)
+            if merge is None:
+                made[one] = leaf.get(one)
+                continue
+            a, b = made[merge[0]], made[merge[1]]
+            made[one] = self._join(a, b, min(merge[2], _SURE)) if a and b else a or b
+        top = made[node]
+        assert top is not None
+        return top

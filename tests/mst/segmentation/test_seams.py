@@ -1,0 +1,182 @@
+"""Ways to divide a region, what is measured of them, and the tree that contains the divisions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings, strategies as st
+
+from mstfilter.base.errors import InputError
+from mstfilter.base.trained import write_model
+from mstfilter.mst.segmentation import ColourDepthBoundary, MergeLogOdds, SeamTree, SeenBorders, optimal_cut
+from mstfilter.mst.segmentation.divisions import SeamImage, divisions
+from mstfilter.mst.segmentation.learned_tree import FEATURES, pair_features
+from mstfilter.mst.segmentation.regions import measure_regions
+from mstfilter.mst.segmentation.seam_measures import SEAM_FEATURES, STRIP, STRIP_CHANNELS, SeamMeasures
+from mstfilter.mst.segmentation.seam_network import INPUTS, SEAM_ARCHITECTURE, SeamNet
+from mstfilter.mst.segmentation.seams import BaseTree, _Examination
+from mstfilter.scene import Frame, pixels_above_table, render
+from tests.mst.segmentation.scenes import GRID, boxes, camera, frame_of
+
+ROW = boxes(((20, 20, 0), (32, 34, 10)), ((32, 20, 0), (46, 34, 10)))
+
+
+def blind(frame):
+    """The output of a border network that sees nothing."""
+    h, w = frame.depth.shape
+    return SeenBorders(
+        np.full((h, w), -4.0, np.float32), np.zeros((h, w), np.float32), np.zeros((h, w, 2), np.float32)
+    )
+
+
+@pytest.fixture(scope="module")
+def touching():
+    """Two boxes in line, of one colour: frame, image of the seams, flat pixels, true object of each pixel."""
+    frame = frame_of(ROW, width=320, noise=0.3)
+    frame = Frame(np.where(frame.rgb == frame.rgb[0, 0], frame.rgb, 90).astype(np.uint8), frame.depth, frame.camera)
+    truth = render(ROW, GRID, camera(320)).labels
+    pixels = np.flatnonzero(pixels_above_table(frame) & (truth > 0))
+    boundary = ColourDepthBoundary().boundary(frame)
+    return frame, SeamImage.of(frame, boundary, blind(frame)), pixels, truth.ravel()[pixels]
+
+
+def agreement(side, truth):
+    """Share of the pixels on the right side, for the better of both ways to name the sides."""
+    right = float(np.mean(side == (truth == truth[0])))
+    return max(right, 1 - right)
+
+
+def test_planes_contain_the_true_division(touching):
+    _, image, pixels, truth = touching
+    found = divisions(image, pixels)
+    assert max(agreement(one.side, truth) for one in found) > 0.97
+    for one in found:
+        assert min(one.side.sum(), (~one.side).sum()) >= 0.04 * len(pixels)
+        assert np.isclose(np.linalg.norm(one.normal), 1.0)
+    for k, one in enumerate(found):  # no division occurs twice, in whatever order its sides are
+        for other in found[:k]:
+            assert 0.02 < np.mean(one.side == other.side) < 0.98
+
+
+def test_parts_of_a_tree_come_first_and_once(touching):
+    _, image, pixels, truth = touching
+    own = truth == 1
+    found = divisions(image, pixels, [own, ~own, np.zeros(len(pixels), bool)])
+    assert found[0].kind == "tree" and (found[0].side == own).all()
+    assert [one.kind for one in found].count("tree") == 1
+
+
+def test_features_of_the_sides_are_those_of_measured_regions(touching):
+    frame, image, pixels, truth = touching
+    objects = np.zeros(frame.depth.shape, bool)
+    objects.ravel()[pixels] = True
+    found = divisions(image, pixels, [truth == 1])
+    x, strips = SeamMeasures.of(image, objects).describe(pixels, found)
+    assert x.shape == (len(found), len(INPUTS)) and np.isfinite(x).all()
+    assert strips.shape == (len(found), len(STRIP_CHANNELS), *STRIP)
+    for k in (0, len(found) - 1):
+        regions = np.zeros(frame.depth.shape, np.int64)
+        regions.ravel()[pixels] = 1 + found[k].side
+        whole = measure_regions(regions, frame, image.boundary, image.seen)
+        a, b = whole.sums[[2]], whole.sums[[1]]
+        none = np.zeros((1, 8))
+        expected = pair_features(a, b, whole.borders[2][1][None], none, none, 0.5, FEATURES)
+        assert np.allclose(x[k, : len(FEATURES)], expected[0], rtol=1e-4, atol=1e-4)
+
+
+def test_strips_follow_the_seam(touching):
+    frame, image, pixels, truth = touching
+    objects = np.zeros(frame.depth.shape, bool)
+    objects.ravel()[pixels] = True
+    found = divisions(image, pixels, [truth == 1])
+    _, strips = SeamMeasures.of(image, objects).describe(pixels, found[:1])
+    first, second = (strips[0, k].astype(float) - 128 for k in (0, 1))
+    left, right = np.s_[16:48, :11], np.s_[16:48, 13:]
+    assert first[left].mean() > 5 * first[right].mean() and second[right].mean() > 5 * second[left].mean()
+
+
+def write_judge(folder, bias):
+    """An untrained judge whose scores are about `bias`."""
+    torch.manual_seed(0)
+    net = SeamNet(8)
+    torch.nn.init.zeros_(net.head[-1].weight)
+    torch.nn.init.constant_(net.head[-1].bias, bias)
+    described = {
+        "architecture": SEAM_ARCHITECTURE,
+        "network": {"channels": [*INPUTS, *STRIP_CHANNELS], "width": 8},
+        "calibration": {"scale": 1.0, "shift": 0.0},
+    }
+    write_model(folder, described, {name: t.numpy() for name, t in net.state_dict().items()})
+    return str(folder)
+
+
+@pytest.fixture(scope="module")
+def judges(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("judges")
+    return {bias: write_judge(folder / f"judge{k}", bias) for k, bias in enumerate((-20.0, -2.0, 5.0))}
+
+
+def test_a_sure_judge_keeps_the_regions_of_the_base_tree(touching, judges):
+    frame, image, _, _ = touching
+    builder = SeamTree(weights=judges[-20.0])
+    tree, base = builder.build(image.boundary, frame), builder.base.build(image.boundary, frame)
+    cuts = [one.label_image(optimal_cut(one, MergeLogOdds().values(one, frame))) for one in (tree, base)]
+    pixels = pixels_above_table(frame)
+    pairs = np.unique(np.stack([cut[pixels] for cut in cuts]), axis=1)
+    assert len(np.unique(pairs[0])) == len(np.unique(pairs[1])) == pairs.shape[1]
+
+
+def test_odds_of_a_division_are_those_of_the_judge_and_the_prior(touching, judges):
+    frame, image, _, _ = touching
+    shares = (0.5, 0.8)
+    trees = [SeamTree(weights=judges[-2.0], one_share=share).build(image.boundary, frame) for share in shares]
+    inner = [tree.odds[tree.n_leaves :] for tree in trees]
+    odds = [found[found > -4.9] for found in inner]
+    for share, found in zip(shares, odds, strict=True):
+        n = np.exp(found[found < 2] + 2.0) * share / (1 - share)  # of n divisions with the score -2
+        assert len(n) > 1 and np.allclose(n, np.rint(n), atol=0.05) and n.min() > 0.9
+
+
+def test_both_sides_of_the_true_seam_are_nodes(touching, judges, monkeypatch):
+    frame, image, pixels, truth = touching
+    label = np.zeros(frame.depth.size, int)
+    label[pixels] = truth
+
+    def knowing(self, pixels, found):
+        """The judge that knows the objects: even odds where there are two."""
+        if min(np.bincount(label[pixels], minlength=3)[1:]) < 0.1 * len(pixels):
+            return -20.0, -1
+        return 0.0, int(np.argmax([agreement(one.side, label[pixels]) for one in found]))
+
+    monkeypatch.setattr(_Examination, "_judged", knowing)
+    built = SeamTree(weights=judges[5.0]).build(image.boundary, frame)
+    masks = [built.mask(node).ravel()[pixels] for node in range(built.n_nodes)]
+    for true in (truth == 1, truth == 2, truth > 0):
+        assert max((mask & true).sum() / (mask | true).sum() for mask in masks) > 0.93
+
+
+@given(st.integers(0, 2**31))
+@settings(max_examples=20, deadline=None)
+def test_nodes_of_a_base_tree_cover_its_regions(seed):
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(3, 12))
+    alive, merges = list(range(1, n)), []
+    while len(alive) > 2:
+        a, b = (alive.pop(int(rng.integers(len(alive)))) for _ in range(2))
+        merges.append((a, b, float(rng.normal(0, 5))))
+        alive.append(n + len(merges) - 1)
+    base = BaseTree(np.arange(n)[None], n, merges)
+    masks = [base.regions_of(node) for node in base.uncertain()]
+    assert (np.sum(masks, axis=0) == np.append(0, np.ones(n - 1))).all()  # each region once, the table never
+    for node in base.uncertain():
+        assert all((part <= base.regions_of(node)).all() for part in base.parts(node))
+
+
+def test_a_tree_needs_a_frame(judges):
+    with pytest.raises(InputError, match="SeamTree needs the frame"):
+        SeamTree(weights=judges[5.0]).build(np.zeros((4, 4), np.float32))
+
+
+def test_seam_features_have_names():
+    assert len(set(INPUTS)) == len(INPUTS) == len(FEATURES) + len(SEAM_FEATURES)
