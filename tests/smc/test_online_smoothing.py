@@ -1,7 +1,7 @@
 """Online sums and two-filter smoothing against all paths of a hidden chain, and against the RTS smoother.
 
 z scores over independent runs. At every change: |z| < 4.5 with few seeds, false alarm below 1e-2 for the file. At
-night: 200 runs of each setting at |z| < 3 (one scalar each, about 4 % for the 16 settings), with room for the bias of
+night: 200 runs of each setting at |z| < 3 (one scalar each, about 4 % for the 17 settings), with room for the bias of
 order 1 / n.
 """
 
