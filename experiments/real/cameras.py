@@ -91,6 +91,7 @@ def run(case: Case, seed: int, sheets: Path | None) -> dict[str, object]:
         return row | {"refused": str(error).splitlines()[0]}
     found, estimated = [], []
     for (state, info), clip, points in zip(preset("mst").iterate(clips, seed), clips, case.points, strict=True):
+        assert state.population is not None
         images = [project(h, clip.after.camera) for h in state.population.particles]
         found += [len({int(image[v, u]) for u, v in points} - {0}) for image in images]
         estimated += [len(np.unique(image[image > 0])) for image in images]
