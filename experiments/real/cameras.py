@@ -1,4 +1,6 @@
-"""How good is `mst` on single images of cameras that nobody tuned on?
+"""How good is `mst` on single images of cameras other than the Xtion of the other real data?
+
+Constants were set by eye on some of these images (see README.md), so the figures are not held out.
 
     python experiments/real/cameras.py                        # a few minutes of one core
     python experiments/real/cameras.py --only uoc_4,camera1 --sheets DIR --out FILE

@@ -24,7 +24,7 @@ from mstfilter.lab.simulation import scene_family
 from mstfilter.lab.simulation.recorder import POSE_TOLERANCE, SimulatedScene
 from mstfilter.lab.simulation.renderer import Renderer
 from mstfilter.lab.simulation.sensor import SENSORS, colour_reading
-from mstfilter.mst.segmentation import Agglomeration, BorderTree, ColourDepthBoundary, ObjectRule, pair_log_odds
+from mstfilter.mst.segmentation import BorderTree, ColourDepthBoundary, ObjectRule
 from mstfilter.mst.segmentation.divisions import Division, SeamImage, divisions
 from mstfilter.mst.segmentation.seam_measures import SeamMeasures
 from mstfilter.mst.segmentation.seams import BaseTree, least_examined
@@ -118,9 +118,7 @@ def _regions(
     boundary = ColourDepthBoundary().boundary(found.frame)
     seen = tree.look(found.frame)
     regions = tree.regions(boundary, found.frame, found.pixels, seen)
-    growing = Agglomeration(regions, pair_log_odds(tree.model()[0], tree.correction(), 1.0))
-    growing.merge_all()
-    base = BaseTree(regions.image, len(regions.sums), growing.merges)
+    base = BaseTree(regions.image, len(regions.sums), tree.merges(regions))
     image = SeamImage.of(found.frame, boundary, seen)
     measures = SeamMeasures.of(image, regions.image > 0)
     flat = instance.ravel()

@@ -327,10 +327,14 @@ class MergedTree(TreeBuilder):
                 f"{type(self).__name__} needs the frame of the boundary map", "tree.build(boundary, frame)"
             )
         regions = self.regions(boundary, frame, pixels_above_table(frame) if pixels is None else pixels)
-        log_odds = pair_log_odds(self.model()[0], self.correction(), scaled_length(1, frame.camera.width))
-        growing = Agglomeration(regions, log_odds)
+        return tree_of_merges(regions.image, len(regions.sums), self.merges(regions))
+
+    def merges(self, regions: Regions) -> list[tuple[int, int, float]]:
+        """All merges of measured regions, in their order: (node, node, log odds), as in `tree_of_merges`."""
+        scale = scaled_length(1, regions.image.shape[1])
+        growing = Agglomeration(regions, pair_log_odds(self.model()[0], self.correction(), scale))
         growing.merge_all()
-        return tree_of_merges(regions.image, len(regions.sums), growing.merges)
+        return growing.merges
 
 
 @dataclass(frozen=True)

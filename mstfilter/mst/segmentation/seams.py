@@ -26,11 +26,11 @@ import numpy as np
 from mstfilter.base.errors import InputError
 from mstfilter.base.fields import Bounds, Share
 from mstfilter.mst.segmentation.divisions import Division, SeamImage, divisions
-from mstfilter.mst.segmentation.learned_tree import Agglomeration, BorderTree, pair_log_odds, tree_of_merges
+from mstfilter.mst.segmentation.learned_tree import BorderTree, tree_of_merges
 from mstfilter.mst.segmentation.regions import Regions
 from mstfilter.mst.segmentation.seam_measures import SeamMeasures
 from mstfilter.mst.segmentation.tree import Tree, TreeBuilder
-from mstfilter.scene import Frame, pixels_above_table, scaled_area, scaled_length
+from mstfilter.scene import Frame, pixels_above_table, scaled_area
 
 if TYPE_CHECKING:
     from mstfilter.mst.segmentation.seam_network import SeamNetwork
@@ -79,10 +79,8 @@ class SeamTree(TreeBuilder):
         pixels = pixels_above_table(frame) if pixels is None else pixels
         seen = self.base.look(frame)
         regions = self.base.regions(boundary, frame, pixels, seen)
-        log_odds = pair_log_odds(self.base.model()[0], self.base.correction(), scaled_length(1, boundary.shape[1]))
-        growing = Agglomeration(regions, log_odds)
-        growing.merge_all()
-        return _Examination(self, self._judge(), SeamImage.of(frame, boundary, seen), regions, growing.merges).tree()
+        image, merges = SeamImage.of(frame, boundary, seen), self.base.merges(regions)
+        return _Examination(self, self._judge(), image, regions, merges).tree()
 
     def _judge(self) -> SeamNetwork:
         from mstfilter.mst.segmentation.seam_network import load_seam_network
