@@ -205,6 +205,12 @@ class Samples:
         """The samples of files."""
         return cls.join([cls(**read_arrays(path, "samples of a training", limit=MAX_WEIGHTS)) for path in paths])
 
+    def save(self, path: str | Path) -> None:
+        """Write the samples to an npz file that `read` reads."""
+        columns: dict[str, Any] = self.columns()
+        with atomic_path(Path(path)) as partial, partial.open("wb") as file:
+            np.savez_compressed(file, **columns)
+
     def columns(self) -> dict[str, np.ndarray]:
         """The arrays by name."""
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
@@ -225,7 +231,6 @@ class Samples:
 def _write_file(job: tuple[Path, type[Samples], int, range, tuple[str, ...]]) -> None:
     path, samples, seed, scenes, kinds = job
     if not path.exists():
-        columns: dict[str, Any] = samples.join([samples.of_scene(seed, k, kinds) for k in scenes]).columns()
+        made = samples.join([samples.of_scene(seed, k, kinds) for k in scenes])
         scene_cache.clear()
-        with atomic_path(path) as partial, partial.open("wb") as file:
-            np.savez_compressed(file, **columns)
+        made.save(path)

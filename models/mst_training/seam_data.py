@@ -7,6 +7,10 @@ Half of the scenes ask the question: in `row`, `stack` and `pack`, things that l
 often as not. The others are `s1` to `s3`. Cameras and sensors are drawn at random, sizes and textures are those for
 tuning. The regions are those that `SeamTree` examines in the tree `border`, and below them the sides of the best
 division, or of a random one. Most regions that plainly are one object are left out.
+
+Real images with label images give samples in the same way:
+
+>>> SeamSamples.of_frame(frame, grid, labels).save("my-images/desk.npz")  # `SeamsTraining(extra="my-images")`
 """
 
 from __future__ import annotations
@@ -27,7 +31,7 @@ from mstfilter.lab.simulation.sensor import SENSORS, colour_reading
 from mstfilter.mst.segmentation import BorderTree, ColourDepthBoundary, ObjectRule
 from mstfilter.mst.segmentation.divisions import Division, SeamImage, divisions
 from mstfilter.mst.segmentation.seam_measures import SeamMeasures
-from mstfilter.mst.segmentation.seams import BaseTree, least_examined
+from mstfilter.mst.segmentation.seams import BaseTree, least_examined, within
 from mstfilter.scene import Camera, Frame, VoxelGrid, look_at, scene_cache
 
 _FAMILIES = {"row": 0.25, "stack": 0.25, "pack": 0.12, "s1": 0.12, "s2": 0.16, "s3": 0.10}
@@ -39,6 +43,7 @@ _FIRST_SEED = 1_000_000  # of scenes; the studies use smaller ones
 _LEAST_PIXELS, _LEAST_SHARE, _LEAST_OWN = 120, 0.15, 0.4
 _WHOLE = 0.7  # share of each object that must be on one side of a division that separates objects
 _PLAIN = {True: 0.85, False: 0.65}  # share of the regions of one object that are used, in scenes with groups or not
+_KNOWN = 0.7  # least share of the pixels of a region that must belong to objects
 _MOST_DEPTH = 3
 _PURE, _AT_RANDOM = 0.93, 0.15  # divisions that are followed: such pure ones, and this share of the others
 
@@ -69,12 +74,33 @@ class SeamSamples(Samples):
             finally:
                 scene_cache.clear()
             if rows:
-                numbered = [
-                    (*row[:3], np.full(len(row[0]), 1000 * index + k), *(np.full(len(row[0]), v) for v in row[3:]))
-                    for k, row in enumerate(rows)
-                ]
-                return cls(*(np.concatenate(column) for column in zip(*numbered, strict=True)))
+                return cls._of_rows(rows, 1000 * index)
         raise InputError(f"no scene number {index} could be made")
+
+    @classmethod
+    def of_frame(cls, frame: Frame, grid: VoxelGrid, labels: np.ndarray, index: int = 0) -> Self:
+        """The samples of image number `index` with the true object (H, W) int of each pixel.
+
+        Objects are 1 .. 255; pixels without a known object have a label below 1. InputError if the image shows no
+        table, or no region that is examined.
+        """
+        if labels.shape != frame.depth.shape or labels.max() > 255:
+            raise InputError(
+                f"labels {labels.shape} up to {labels.max()}", f"expected {frame.depth.shape} and at most 255 objects"
+            )
+        rng = np.random.default_rng(index)
+        if not (rows := [*_regions(rng, frame, grid, np.maximum(labels, 0), True)]):
+            raise InputError("the image shows no region that is examined")
+        return cls._of_rows(rows, 1000 * index)
+
+    @classmethod
+    def _of_rows(cls, rows: list[_Row], first: int) -> Self:
+        """Samples of regions that are numbered from `first` on."""
+        numbered = [
+            (*row[:3], np.full(len(row[0]), first + k), *(np.full(len(row[0]), v) for v in row[3:]))
+            for k, row in enumerate(rows)
+        ]
+        return cls(*(np.concatenate(column) for column in zip(*numbered, strict=True)))
 
 
 _Row = tuple[np.ndarray, np.ndarray, np.ndarray, int, int, bool]
@@ -130,6 +156,8 @@ def _regions(
             if len(pixels) < least_examined(flat.size) or not (divided := divisions(image, pixels, parts)):
                 continue
             purity, n = _purity(flat[pixels], divided, visible)
+            if (flat[pixels] > 0).mean() < _KNOWN:
+                continue
             if n == 0 or (n == 1 and depth == 0 and rng.uniform() > _PLAIN[grouped]):
                 continue
             yield (*measures.describe(pixels, divided), purity, n, depth, grouped)
@@ -141,7 +169,7 @@ def _regions(
                     side = divided[int(rng.integers(len(divided)))].side
                 else:
                     continue
-                todo += [(pixels[one], [part[one] for part in parts], depth + 1) for one in (side, ~side)]
+                todo += [(pixels[one], within(parts, one), depth + 1) for one in (side, ~side)]
 
 
 def _purity(instance: np.ndarray, divided: list[Division], visible: np.ndarray) -> tuple[np.ndarray, int]:

@@ -4,14 +4,16 @@
 
 A batch is a set of regions. If a region is one object, its loss is -log P(one); else it is -log of the probability of
 all divisions that separate its objects cleanly, or -log(1 - P(one)) if there is none. So the judge need not choose
-among divisions that are equally good. Strips are mirrored, and their colours are weakened or taken away. At the end,
-scale and shift of the scores are fitted to the validation samples.
+among divisions that are equally good. Strips are mirrored, and their colours are weakened or taken away. With
+`extra`, regions of labelled images join each batch. At the end, scale and shift of the scores are fitted to the
+validation samples.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -40,10 +42,13 @@ class SeamsTraining(Training):
     n_test: int = 60
     width: int = 24
     steps: int = 6000
-    batch: int = 24  #: regions
+    batch: int = 24  #: regions of simulated scenes
     average: float = 0.995
     half_precision: bool = False
     colour_dropout: float = 0.15  #: share of the batches without colours
+    extra: str = ""  #: folder with files of further samples (`SeamSamples.of_frame`); none if empty
+    extra_without: str = ""  #: names of the files that are left out, without ending, separated by commas
+    extra_batch: int = 8  #: regions of a batch from the further samples
 
     recipes: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "cpu": {},
@@ -59,15 +64,29 @@ class SeamsTraining(Training):
 
     def batches(self, samples: SeamSamples, first: int, last: int) -> Iterator[tuple[Tensor, ...]]:
         """Inputs, strips, purities, number of the region of each division, and the objects of each region."""
-        rows = _by_region(samples)
+        rows, further = _by_region(samples), self._extra()
+        extra_rows = [] if further is None else _by_region(further)
         for step, chosen in self.order(len(rows), first, last):
             rng = np.random.default_rng([self.seed, 2, step])
-            x, strips, *others = _batch(samples, [rows[k] for k in chosen.tolist()])
+            batch = _batch(samples, [rows[k] for k in chosen.tolist()])
+            if further is not None:
+                drawn = rng.integers(len(extra_rows), size=self.extra_batch).tolist()
+                batch = _joined(batch, _batch(further, [extra_rows[k] for k in drawn]))
+            x, strips, *others = batch
             if rng.uniform() < 0.5:
                 strips = strips.flip(3)[:, [1, 0, *range(2, len(STRIP_CHANNELS))]]
                 strips[:, _TURNED] *= -1
             strips[:, _COLOURS] *= 0.0 if rng.uniform() < self.colour_dropout else float(rng.uniform(0.5, 1.2))
             yield x, strips, *others
+
+    def _extra(self) -> SeamSamples | None:
+        if not self.extra:
+            return None
+        without = {name.strip() for name in self.extra_without.split(",")}
+        files = sorted(path for path in Path(self.extra).glob("*.npz") if path.stem not in without)
+        if not files:
+            raise InputError(f"{self.extra} has no files of samples", "an npz file of SeamSamples for each sequence")
+        return SeamSamples.read(files)
 
     def loss(
         self, networks: Mapping[str, Any], step: int, batch: Sequence[Tensor]
@@ -147,6 +166,13 @@ def _batch(samples: SeamSamples, regions: list[np.ndarray]) -> tuple[Tensor, ...
         *(x, decoded(samples.strip[rows]), torch.from_numpy(samples.purity[rows])),
         *(torch.from_numpy(of), torch.from_numpy(samples.objects[first].astype(np.int64))),
     )
+
+
+def _joined(one: tuple[Tensor, ...], other: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    """Two batches as one."""
+    n = len(one[4])  # regions of the first one
+    other = (*other[:3], other[3] + n, other[4])
+    return tuple(torch.cat(pair) for pair in zip(one, other, strict=True))
 
 
 _Judged = tuple[Tensor, Tensor, Tensor, Tensor]  # scores, purity, region, objects: see `region_losses`

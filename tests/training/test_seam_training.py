@@ -81,7 +81,7 @@ def test_purity():
     visible = np.bincount(np.repeat([0, 1, 2, 3], (50, 400, 300, 900)), minlength=256)
     sides = {"clean": instance == 1, "half": np.arange(len(instance)) % 2 == 0, "one object": instance == 0}
     sides["oblique"] = np.arange(len(instance)) < 400
-    found, n = _purity(instance, [Division(side, "tree", np.zeros(3), 0.0) for side in sides.values()], visible)
+    found, n = _purity(instance, [Division(side, "tree", np.zeros(3), 0.0, 1.0, 0.0) for side in sides.values()], visible)
     assert n == 2
     assert dict(zip(sides, found, strict=True)) == pytest.approx(
         {"clean": 1.0, "half": 0.0, "one object": 0.0, "oblique": 650 / 700}
@@ -90,7 +90,7 @@ def test_purity():
 
 @pytest.mark.nightly
 def test_a_sample_depends_on_its_scene_alone():
-    first, again = (SeamSamples.of_scene(4, 2) for _ in range(2))
+    first, again = (SeamSamples.of_scene(5, 1) for _ in range(2))
     for name, values in first.columns().items():
         assert np.array_equal(values, again.columns()[name]), name
     assert first.x.shape[1] == len(INPUTS) and np.isfinite(first.x).all()

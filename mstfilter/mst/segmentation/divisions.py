@@ -9,7 +9,7 @@ border, it still goes on. So the divisions of a region are
 - merges of a segmentation tree inside the region, which follow borders of any form.
 
 >>> image = SeamImage.of(frame, boundary, seen)
->>> found = divisions(image, pixels, parts)       # of the region with these flat pixels; parts (k, n) of a tree
+>>> found = divisions(image, pixels, parts)       # of the region with these flat pixels; parts of a tree
 >>> found[0].kind, found[0].side.mean()           # the kind, and the share of the pixels on the first side
 
 The axes of the world are those of the table: z points up.
@@ -17,7 +17,7 @@ The axes of the world are those of the table: z points up.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -36,6 +36,14 @@ _SAME = 0.9  # two divisions with a larger overlap (IoU of both sides) are the s
 _LEAST_SHARE, _LEAST_PIXELS = 0.04, 150  # of a side; pixels of an image of 640 x 480
 _MARGIN = 3  # pixels of an image 640 wide: evidence so close to the outline of a region is that of the outline
 _MOST_POINTS = 2500  # readings that vote for planes
+_UNKNOWN = -8.0  # log odds, and the largest size of them: a tree without a merge that resembles a division
+
+
+class Part(NamedTuple):
+    """A part of a region that a segmentation tree knows."""
+
+    side: np.ndarray  #: (n,) bool, its pixels among those of the region
+    odds: float  #: log odds of the merge that joins it to the rest: different objects against one
 
 
 class Division(NamedTuple):
@@ -45,6 +53,8 @@ class Division(NamedTuple):
     kind: str  #: one of `KINDS`
     normal: np.ndarray  #: (3,) of the plane, in the world; zero for a division of the tree
     offset: float  #: of the plane along its normal, metres
+    overlap: float  #: 0 .. 1, with the part of the tree that is most similar (IoU of both sides, the smaller one)
+    odds: float  #: log odds of that part, -8 .. 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,18 +75,18 @@ class SeamImage:
         return cls(frame, points, evidence.astype(np.float32), boundary, seen)
 
 
-def divisions(image: SeamImage, pixels: np.ndarray, parts: Iterable[np.ndarray] = ()) -> list[Division]:
+def divisions(image: SeamImage, pixels: np.ndarray, parts: Sequence[Part] = ()) -> list[Division]:
     """The divisions of the region with the flat `pixels` (n,); see the module.
 
-    `parts` are the parts of the region that a tree knows, (n,) bool each, in order of importance. Divisions that are
-    nearly equal occur once; both sides of each have a sensible size.
+    `parts` are those of the region that a tree knows, in order of importance. Divisions that are nearly equal occur
+    once; both sides of each have a sensible size.
     """
     points = image.points.reshape(-1, 3)[pixels]
     evidence = _inner_evidence(image, pixels)
-    found = _Distinct(len(pixels), _least(image, len(pixels)))
+    found = _Distinct(parts, len(pixels), _least(image, len(pixels)))
     for part in parts:
         if found.count("tree") < _MOST["tree"]:
-            found.add(Division(part, "tree", np.zeros(3), 0.0))
+            found.add(part.side, "tree", np.zeros(3), 0.0)
     read = np.isfinite(points[:, 2])
     if read.sum() > 20:
         known = points[read]
@@ -90,10 +100,10 @@ def divisions(image: SeamImage, pixels: np.ndarray, parts: Iterable[np.ndarray] 
             for _, k, offset in _peaks(known[some], evidence[read][some], normals):
                 if found.count(kind) >= _MOST[kind]:
                     break
-                found.add(Division(filled @ normals[k] < offset, kind, normals[k], offset))
+                found.add(filled @ normals[k] < offset, kind, normals[k], offset)
         for normal, offset in _middles(known[some])[: _MOST["middle"]]:
             kind = "level" if normal[2] else "upright"
-            found.add(Division(filled @ normal < offset, kind, normal, offset))
+            found.add(filled @ normal < offset, kind, normal, offset)
     return found.divisions
 
 
@@ -104,26 +114,32 @@ def _least(image: SeamImage, n: int) -> float:
 class _Distinct:
     """Divisions that differ from one another."""
 
-    def __init__(self, n: int, least: float) -> None:
-        self.n, self.least = n, least
+    def __init__(self, parts: Sequence[Part], n: int, least: float) -> None:
+        self.parts, self.n, self.least = parts, n, least
         self.divisions: list[Division] = []
 
     def count(self, kind: str) -> int:
         return sum(one.kind == kind for one in self.divisions)
 
-    def add(self, division: Division) -> None:
-        side = division.side
+    def add(self, side: np.ndarray, kind: str, normal: np.ndarray, offset: float) -> None:
         size = int(side.sum())
         if min(size, self.n - size) < self.least:
             return
-        for other in self.divisions:
-            common = int((side & other.side).sum())
-            theirs = int(other.side.sum())
-            if _overlap(common, size, theirs, self.n) > _SAME or (
-                _overlap(theirs - common, self.n - size, theirs, self.n) > _SAME
-            ):
-                return
-        self.divisions.append(division)
+        if any(_similarity(side, other.side) > _SAME for other in self.divisions):
+            return
+        overlap, odds = 0.0, _UNKNOWN
+        for part in self.parts:
+            if (common := _similarity(side, part.side)) > overlap:
+                overlap, odds = common, part.odds
+        self.divisions.append(
+            Division(side, kind, normal, offset, overlap, float(np.clip(odds, _UNKNOWN, -_UNKNOWN)))
+        )
+
+
+def _similarity(one: np.ndarray, other: np.ndarray) -> float:
+    """How similar two divisions of a region are, given a side (n,) bool of each: 1 if they are the same."""
+    common, a, b, n = int((one & other).sum()), int(one.sum()), int(other.sum()), len(one)
+    return max(_overlap(common, a, b, n), _overlap(b - common, n - a, b, n))
 
 
 def _overlap(common: int, a: int, b: int, n: int) -> float:

@@ -5,8 +5,8 @@ two looks at its ends, where the outlines of two objects do not quite fit, and a
 through faces, prints and edges. So each division is described by
 
 - the `FEATURES` of the pair of its sides, as those that the tree merges;
-- `SEAM_FEATURES`: how the evidence runs along the seam, how well the sides fit to each other, and whether the region
-  or its sides are the more compact;
+- `SEAM_FEATURES`: how the evidence runs along the seam, how well the sides fit to each other, whether the region or
+  its sides are the more compact, and what the tree says of the most similar of its own merges;
 - a *strip*: an image of `STRIP` pixels that follows the seam, in `STRIP_CHANNELS`.
 
 >>> measures = SeamMeasures.of(image)
@@ -41,6 +41,7 @@ SEAM_FEATURES = (
     *("seam evidence", "seam low evidence", "seam strong share", "region evidence", "seam border"),
     *("step along", "top gap", "bottom gap", "near end", "far end"),
     *("hull gain", "solid region", "solid sides", "ground hull gain", "rectangle gain"),
+    *("tree overlap", "tree odds"),
 )
 _LEVELS = 128.0  # a strip stores x as rint(x * 64) + 128, so -2 .. 1.98 in 256 levels
 _REACH = 1.3  # a strip is so many times as long as its seam
@@ -200,6 +201,7 @@ class _Region:
                     float(np.log(n / hulls[:, 0].sum())),
                     float(np.log(all_ground / max(hulls[:, 1].sum(), 1e-6))),
                     float(np.log(all_box / max(hulls[:, 2].sum(), 1e-6))),
+                    *(division.overlap, division.odds),
                 ]
             )
         return np.array(rows)

@@ -25,7 +25,7 @@ import numpy as np
 
 from mstfilter.base.errors import InputError
 from mstfilter.base.fields import Bounds, Share
-from mstfilter.mst.segmentation.divisions import Division, SeamImage, divisions
+from mstfilter.mst.segmentation.divisions import Division, Part, SeamImage, divisions
 from mstfilter.mst.segmentation.learned_tree import BorderTree, tree_of_merges
 from mstfilter.mst.segmentation.regions import Regions
 from mstfilter.mst.segmentation.seam_measures import SeamMeasures
@@ -35,7 +35,7 @@ from mstfilter.scene import Frame, pixels_above_table, scaled_area
 if TYPE_CHECKING:
     from mstfilter.mst.segmentation.seam_network import SeamNetwork
 
-_CERTAIN = 3.0  # log odds: merges of the base tree above this stay as they are
+_CERTAIN = 7.0  # log odds: merges of the base tree above this stay as they are
 _KNOWN = -6.0  # log odds: merges of the base tree below this are no divisions to examine
 _SURE = -5.0  # most log odds of merges inside a region that is judged to be one object
 _LEAST_PIXELS = 400  # of a region that is examined, in an image of 640 x 480
@@ -93,6 +93,11 @@ def least_examined(size: int) -> float:
     return scaled_area(_LEAST_PIXELS, size)
 
 
+def within(parts: Sequence[Part], side: np.ndarray) -> list[Part]:
+    """The parts of one side (n,) bool of a region."""
+    return [Part(part.side[side], part.odds) for part in parts]
+
+
 @dataclass(frozen=True, eq=False)
 class BaseTree:
     """A tree of merges: the regions below each node, and its merge."""
@@ -117,11 +122,11 @@ class BaseTree:
                 found.append(node)
         return sorted(found)
 
-    def region(self, node: int) -> tuple[np.ndarray, list[np.ndarray]]:
-        """The flat pixels (n,) below a node, and the parts (n,) bool of it that the tree knows."""
+    def region(self, node: int) -> tuple[np.ndarray, list[Part]]:
+        """The flat pixels (n,) below a node, and the parts of it that the tree knows."""
         flat = self.image.ravel()
         pixels = np.flatnonzero(self.regions_of(node)[flat])
-        return pixels, [part[flat[pixels]] for part in self.parts(node)]
+        return pixels, [Part(part.side[flat[pixels]], part.odds) for part in self.parts(node)]
 
     def merge_of(self, node: int) -> tuple[int, int, float] | None:
         """The merge that makes a node, None for a region."""
@@ -139,15 +144,15 @@ class BaseTree:
                 stack += self.merges[one - self.n][:2]
         return found
 
-    def parts(self, node: int) -> list[np.ndarray]:
-        """Regions (n,) bool on one side of the merges below a node that may divide objects, most divided first."""
+    def parts(self, node: int) -> list[Part]:
+        """The sides, as regions (n,) bool, of the merges below a node that may divide objects, most divided first."""
         found, stack = [], [node]
         while stack:
             if (merge := self.merge_of(stack.pop())) is not None:
                 found.append(merge)
                 stack += merge[:2]
         found = sorted(found, key=lambda merge: -merge[2])[:_MOST_MERGES]
-        return [self.regions_of(child) for *children, odds in found if odds >= _KNOWN for child in children]
+        return [Part(self.regions_of(child), odds) for *children, odds in found if odds >= _KNOWN for child in children]
 
 
 class _Examination:
@@ -198,7 +203,7 @@ class _Examination:
         a, b, odds = merge
         return self._join(self._upper(a), self._upper(b), odds)
 
-    def _examined(self, node: int, pixels: np.ndarray, parts: Sequence[np.ndarray], depth: int) -> tuple[str, int]:
+    def _examined(self, node: int, pixels: np.ndarray, parts: Sequence[Part], depth: int) -> tuple[str, int]:
         """The subtree of some pixels (n,) below a node of the base tree; `parts` are those of `divisions`."""
         if depth <= _MOST_DEPTH and len(pixels) >= self.least:
             found = divisions(self.image, pixels, parts)
@@ -207,9 +212,7 @@ class _Examination:
                 # The sides of an improbable division are seldom in a sample, so they are not examined.
                 depth = depth + 1 if log_odds > _FOLLOWED else _MOST_DEPTH + 1
                 side = found[best].side
-                below = [
-                    self._examined(node, pixels[one], [part[one] for part in parts], depth) for one in (side, ~side)
-                ]
+                below = [self._examined(node, pixels[one], within(parts, one), depth) for one in (side, ~side)]
                 return self._join(below[0], below[1], float(log_odds))
         return self._kept(node, pixels)
 
