@@ -12,21 +12,18 @@ each pause), sequences.csv (means over pauses), summary.csv (`mst` minus each me
 from __future__ import annotations
 
 import argparse
-import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
-from safetensors.numpy import load_file
+from folds import border_model
 from scores import identities, image_scores, kept, witness_scores
-from sequences import FOLDS, SHARED, Sequence, sequences
+from sequences import SHARED, Sequence, sequences
 
 from mstfilter.base.files import read_csv, write_csv
-from mstfilter.base.trained import open_model, write_model
 from mstfilter.mst.segmentation import BorderTree
 from mstfilter.runs.presets import preset
 from mstfilter.scene import Clip, Hypothesis, outlined, project
@@ -50,10 +47,7 @@ METHODS: dict[str, tuple[str, ...]] = {
     "floor_components": ("floor_components",),
     "floor_one_blob": ("floor_one_blob",),
 }
-#: Tensors of the corrections of the border model by fold (../segmentation_fit/correction.py)
-CORRECTIONS = load_file(HERE / "folds.safetensors")
 _WORST = 12  # pauses on a contact sheet
-_SCRATCH = tempfile.TemporaryDirectory()
 
 
 def held_out(sequence: Sequence, method: str, by_sequence: bool = False) -> list[str]:
@@ -67,8 +61,7 @@ def held_out(sequence: Sequence, method: str, by_sequence: bool = False) -> list
         return []
     changes = []
     if isinstance(preset(*METHODS[method]).proposal.tree, BorderTree):
-        folds = [fold for fold, left_out in FOLDS.items() if sequence.name in left_out]
-        changes = [f"proposal.tree.weights={_fold_model(folds[-1 if by_sequence else 0])}"]
+        changes = [f"proposal.tree.weights={border_model(sequence.name, by_sequence)}"]
     if sequence.source == "hots":
         return changes
     row = next(r for r in read_csv(CONSTANTS) if r["frames"] == sequence.name)
@@ -76,15 +69,6 @@ def held_out(sequence: Sequence, method: str, by_sequence: bool = False) -> list
     weight = row["colour_weight" if contour else "colour_weight_learned"]
     changes += ["proposal.boundary.component=colour_depth", f"proposal.boundary.colour_weight={weight}"]
     return changes + [f"proposal.tree.{field}={row[field]}" for field in ("centre", "slope") if contour]
-
-
-@cache
-def _fold_model(fold: str) -> str:
-    """A folder with the border model and the correction of a fold. The folder exists until the process ends."""
-    model, folder = open_model("border"), Path(_SCRATCH.name) / fold.replace(", ", "-")
-    own = {name.removeprefix(f"{fold}/"): t for name, t in CORRECTIONS.items() if name.startswith(f"{fold}/")}
-    write_model(folder, model.description, {**model.tensors, **own})
-    return str(folder)
 
 
 def run(

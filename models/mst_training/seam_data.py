@@ -6,7 +6,7 @@
 Half of the scenes ask the question: in `row`, `stack` and `pack`, things that look like several objects are one as
 often as not. The others are `s1` to `s3`. Cameras and sensors are drawn at random, sizes and textures are those for
 tuning. The regions are those that `SeamTree` examines in the tree `border`, and below them the sides of the best
-division, or of a random one. Most regions that plainly are one object are left out.
+division, or of a random one. Some of the regions that plainly are one object are left out.
 
 Real images with label images give samples in the same way:
 
@@ -78,18 +78,20 @@ class SeamSamples(Samples):
         raise InputError(f"no scene number {index} could be made")
 
     @classmethod
-    def of_frame(cls, frame: Frame, grid: VoxelGrid, labels: np.ndarray, index: int = 0) -> Self:
+    def of_frame(
+        cls, frame: Frame, grid: VoxelGrid, labels: np.ndarray, index: int = 0, tree: BorderTree | None = None
+    ) -> Self:
         """The samples of image number `index` with the true object (H, W) int of each pixel.
 
-        Objects are 1 .. 255; pixels without a known object have a label below 1. InputError if the image shows no
-        table, or no region that is examined.
+        Objects are 1 .. 255; pixels without a known object have a label below 1. The regions are those of `tree`,
+        by default of `BorderTree()`. InputError if the image shows no table, or no region that is examined.
         """
         if labels.shape != frame.depth.shape or labels.max() > 255:
             raise InputError(
                 f"labels {labels.shape} up to {labels.max()}", f"expected {frame.depth.shape} and at most 255 objects"
             )
         rng = np.random.default_rng(index)
-        if not (rows := [*_regions(rng, frame, grid, np.maximum(labels, 0), True)]):
+        if not (rows := [*_regions(rng, frame, grid, np.maximum(labels, 0), True, tree or BorderTree())]):
             raise InputError("the image shows no region that is examined")
         return cls._of_rows(rows, 1000 * index)
 
@@ -111,7 +113,7 @@ def _rows(rng: np.random.Generator, seed: int) -> Iterator[_Row]:
     name = str(rng.choice([*_FAMILIES], p=[*_FAMILIES.values()]))
     sensor: Any = str(rng.choice(["xtion", "xtion", "xtion", *SENSORS]))
     family = replace(scene_family(name), n_actions=0, catalogue="tuning", sensor=sensor, arm=False, one_share=0.5)
-    scene = SimulatedScene(family, seed)
+    scene, tree = SimulatedScene(family, seed), BorderTree()
     for _ in range(_N_VIEWS):
         camera = family.camera() if rng.uniform() < _OWN_CAMERA else _camera(rng, scene)
         view = Renderer(scene.world, scene.objects.skins, scene.room, camera, True, POSE_TOLERANCE).render()
@@ -120,7 +122,7 @@ def _rows(rng: np.random.Generator, seed: int) -> Iterator[_Row]:
         rgb = colour_reading(rng, view.colour * scene.room.exposure)
         measured = displaced(rng, camera) if rng.uniform() < 0.6 else camera
         try:
-            yield from _regions(rng, Frame(rgb, depth, measured), scene.grid, view.instance, name in _GROUPED)
+            yield from _regions(rng, Frame(rgb, depth, measured), scene.grid, view.instance, name in _GROUPED, tree)
         except InputError:  # the view shows no table
             continue
 
@@ -136,10 +138,14 @@ def _camera(rng: np.random.Generator, scene: SimulatedScene) -> Camera:
 
 
 def _regions(
-    rng: np.random.Generator, frame: Frame, grid: VoxelGrid, instance: np.ndarray, grouped: bool
+    rng: np.random.Generator,
+    frame: Frame,
+    grid: VoxelGrid,
+    instance: np.ndarray,
+    grouped: bool,
+    tree: BorderTree,
 ) -> Iterator[_Row]:
     """The regions of one image with their divisions."""
-    tree = BorderTree()
     found = ObjectRule().foreground(frame, grid)
     boundary = ColourDepthBoundary().boundary(found.frame)
     seen = tree.look(found.frame)

@@ -22,9 +22,10 @@ others (or, if the group is one, the whole), "together" moves all parts as one b
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -35,7 +36,7 @@ from mstfilter.lab.simulation.shapes import Part, Pool, Shape, draw_shape
 from mstfilter.lab.simulation.solids import box
 from mstfilter.lab.simulation.textures import Skin, draw_skin, sliced
 from mstfilter.lab.simulation.world import FingerPush, PhysicsWorld, draw_push, tried_pushes
-from mstfilter.scene import Recording
+from mstfilter.scene import Frame, Recording
 
 _OFFSET, _TURN, _GAP = 0.01, np.deg2rad(5.0), 0.002  # largest errors of setting down by hand
 _APART, _STILL = 0.010, 0.001  # metres: parts moved apart; nothing moved
@@ -98,7 +99,7 @@ class Group:
         height = np.abs(at[:, 2] - meant[:, 2]).max()
         return bool(np.abs(distance - planned).max() < 0.008 and height < 0.008)
 
-    def describe(self) -> dict[str, object]:
+    def describe(self) -> dict[str, Any]:
         """The group in the manifest of a recording: ids of objects, and each part in the frame of its object."""
         parts = self._body().parts if self.one else [Part(p.shape, np.eye(3), np.zeros(3)) for p in self.parts]
         owners = self.objects * (len(parts) if self.one else 1)
@@ -315,10 +316,17 @@ def part_image(recording: Recording, frame: int) -> np.ndarray:
     instance, image, poses = recording.instance(frame), recording.frames[frame], recording.poses(frame)
     if instance is None or poses is None:
         raise InputError(f"recording {recording.name} has no true poses and instances", "simulate it")
+    return parts_in(image, instance, poses, recording.manifest.get("groups", []))
+
+
+def parts_in(
+    image: Frame, instance: np.ndarray, poses: Mapping[int, np.ndarray], groups: Sequence[Mapping[str, Any]]
+) -> np.ndarray:
+    """As `part_image`, from a frame with the object (H, W) of each pixel, poses (4, 4) of the objects, and groups."""
     points = image.camera.unproject(image.depth)
     found = np.zeros(instance.shape, np.uint16)
     number = 0
-    for group in recording.manifest.get("groups", []):
+    for group in groups:
         best = np.full(instance.shape, np.inf)
         for part in group["parts"]:
             number += 1

@@ -22,8 +22,10 @@ import numpy as np
 
 from mstfilter.base.errors import InputError, check_component, check_integer
 from mstfilter.lab.simulation.families import SceneFamily
+from mstfilter.lab.simulation.groups import parts_in
 from mstfilter.lab.simulation.recorder import SimulatedScene, stream
 from mstfilter.lab.simulation.world import FingerPush, PushEffect, draw_push, is_clear
+from mstfilter.mst.belief.pushes import PushCandidate
 from mstfilter.scene import Clip, Frame, Recording, VoxelGrid
 
 
@@ -92,6 +94,17 @@ class PushLoop:
         """Number of pushes played."""
         return len(self.effects)
 
+    @property
+    def groups(self) -> list[dict[str, Any]]:
+        """The groups of the scene, as in the manifest of a recording."""
+        return [group.describe() for group in self._scene.objects.groups]
+
+    def part_image(self) -> np.ndarray:
+        """Which part of a group each pixel of the present pause shows; see `groups.part_image`."""
+        last = self._recorded[-1]
+        poses = dict(enumerate(self._scene.world.poses(), start=1))
+        return parts_in(last.frame, last.instance, poses, self.groups)
+
     def candidates(self, n: int) -> tuple[FingerPush, ...]:
         """`n` random pushes towards objects. Each push starts at a free position. The scene does not change.
 
@@ -111,8 +124,13 @@ class PushLoop:
             f"there is no room for {n} pushes between the objects, only for {len(found)}", "ask for fewer"
         )
 
-    def play(self, push: FingerPush) -> Clip:
-        """Simulate and record a push. Returns the clip from the last pause to the new pause."""
+    def play(self, push: FingerPush | PushCandidate) -> Clip:
+        """Simulate and record a push, for example the first of `push_candidates`.
+
+        Returns the clip from the last pause to the new pause.
+        """
+        if isinstance(push, PushCandidate):
+            push = FingerPush.with_tip(push.start, push.end, self.family.action_seconds)
         check_component("push", push, FingerPush)
         first = len(self._recorded) - 1
         self.effects.append(self._scene.play(push, self._add_frame))

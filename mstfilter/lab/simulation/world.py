@@ -341,6 +341,13 @@ class FingerPush:
     start: tuple[float, float]  #: (x, y) metres, where the finger comes down
     end: tuple[float, float]  #: (x, y) metres, where the finger goes up
     seconds: float  #: from one pause to the next, without the time to settle
+    height: float = _LOW  #: metres, of the middle of the finger above the table
+
+    @classmethod
+    def with_tip(cls, start: np.ndarray, end: np.ndarray, seconds: float) -> FingerPush:
+        """A push from one point (3,) to another, at which the tip of the finger touches an object."""
+        height = float(start[2]) + _FINGER_HALF
+        return cls((float(start[0]), float(start[1])), (float(end[0]), float(end[1])), seconds, max(height, _LOW))
 
     def swept(self, grid: VoxelGrid) -> np.ndarray:
         """(X, Y, Z) bool: voxels with centres in the volume that the finger sweeps."""
@@ -348,7 +355,7 @@ class FingerPush:
         a, b = np.array(self.start), np.array(self.end)
         along = np.clip((centres[..., :2] - a) @ (b - a) / max(float((b - a) @ (b - a)), 1e-12), 0.0, 1.0)
         beside = np.linalg.norm(centres[..., :2] - a - along[..., None] * (b - a), axis=-1)
-        above = np.abs(centres[..., 2] - _LOW)
+        above = np.abs(centres[..., 2] - self.height)
         return np.asarray((beside <= _FINGER_RADIUS) & (above <= _FINGER_HALF + _FINGER_RADIUS))
 
     def target(self, t: float) -> np.ndarray:
@@ -356,11 +363,11 @@ class FingerPush:
         a, b = np.array(self.start), np.array(self.end)
         share = t / self.seconds
         if share < _DOWN:
-            return np.array([*a, _HIGH + (_LOW - _HIGH) * share / _DOWN])
+            return np.array([*a, _HIGH + (self.height - _HIGH) * share / _DOWN])
         if share < _DOWN + _PUSH:
-            return np.array([*(a + (b - a) * (share - _DOWN) / _PUSH), _LOW])
+            return np.array([*(a + (b - a) * (share - _DOWN) / _PUSH), self.height])
         if share < _DOWN + _PUSH + _UP:
-            return np.array([*b, _LOW + (_HIGH - _LOW) * (share - _DOWN - _PUSH) / _UP])
+            return np.array([*b, self.height + (_HIGH - self.height) * (share - _DOWN - _PUSH) / _UP])
         return _PARKED
 
 

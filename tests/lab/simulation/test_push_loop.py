@@ -10,6 +10,7 @@ import pytest
 from mstfilter import Belief, preset
 from mstfilter.base.errors import InputError
 from mstfilter.lab.simulation import FingerPush, PushLoop, SimulatedScene, scene_family, simulate_recording
+from mstfilter.mst.belief.pushes import PushCandidate
 from mstfilter.scoring import ask, object_status
 
 FAMILY = replace(
@@ -83,6 +84,21 @@ def test_a_filter_decides():
     push = belief.most_informative(pushes, lambda p: belief.push_information(p.swept(loop.grid), tolerance=20))
     state, _ = mst.step(state, loop.play(push or pushes[0]))
     assert state.t == 2 and state.population.particles[0].grid == loop.grid
+
+
+def test_a_candidate_pushes_at_its_height_and_parts_are_shown():
+    loop = PushLoop(replace(scene_family("stack"), width=160, height=120, frames_per_clip=6, arm=False), 0)
+    parts, truth = loop.part_image(), loop.recording().instance(0)
+    numbers = [part["object"] for group in loop.groups for part in group["parts"]]
+    for k, owner in enumerate(numbers, start=1):
+        assert (truth[parts == k] == owner).all()
+    assert np.isin(truth[parts > 0], numbers).all() and (parts > 0).sum() > 100
+    above = np.array([0.1, 0.0, 0.15])
+    push = FingerPush.with_tip(above, above + (0.05, 0, 0), 1.0)
+    assert push.target(0.5)[2] == pytest.approx(0.25) and FingerPush.with_tip(0 * above, above, 1.0).height < 0.13
+    candidate = PushCandidate(above, np.array([1.0, 0, 0]), 0.05, 0.1, None, 0.02)
+    loop.play(candidate)
+    assert loop.n_pushes == 1
 
 
 @pytest.mark.parametrize("n", [0, 1.5])

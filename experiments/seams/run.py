@@ -1,0 +1,236 @@
+"""How well does the tree with seams tell one object from two, in simulated and in real images?
+
+    python experiments/seams/run.py samples FOLDER        # training samples of the labelled real images
+    python experiments/seams/run.py score --out FOLDER [--judge MODEL] [--fold hots=MODEL,osd=MODEL]
+        [--shares .5,.9] [--scenes s1,s2,s3] [--seeds 0-9] [--no-real]
+    python experiments/seams/run.py score --smoke --out FOLDER
+
+Both need the data in MSTFILTER_SHARED (default ../shared) under real/; `score` works without.
+
+`score` compares the trees `border` and `seams` on label images: the first pauses of simulated scenes, and all labelled
+pauses of HOTS and OSD. On real images the border model and the judge are those of a fold: neither was trained or
+fitted with frames of that camera set-up (of the border model for OSD: of that group). With 30 exact draws for each
+image:
+
+- `quality`: weighted coverage in the image, of the optimal cut and mean of the draws.
+- `merged`: of pairs of true objects that touch in the image, the mean share of draws in which they have one segment.
+- `split`: of true objects, the mean share of draws in which a second segment has a tenth of their pixels.
+- `log_loss`: of the question whether two pixels belong to one object. Pairs of pixels are drawn within objects and
+  across the borders of touching objects, 12 for each; forecasts are softened by .02.
+
+scores.csv has a row for each image, tree and share; summary.csv the means by family or data set.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.ndimage import maximum_filter, minimum_filter
+
+from mst_training.seam_data import SeamSamples
+from mstfilter.base.errors import InputError
+from mstfilter.base.files import write_csv
+from mstfilter.lab.simulation import SCENE_FAMILIES, SimulatedScene
+from mstfilter.mst.segmentation import BorderTree, ExactCuts, ObjectRule, SeamTree, TreeCutProposal, optimal_cut
+from mstfilter.scene import Frame, VoxelGrid, scaled_area, scene_cache
+from mstfilter.scoring import weighted_coverage
+from mstfilter.scoring.forecasts import SOFTENING
+
+REAL = Path(__file__).resolve().parent.parent / "real"
+sys.path.append(str(REAL))
+from folds import border_model  # noqa: E402
+from sequences import SHARED, sequences  # noqa: E402
+
+DRAWS, PAIRS = 30, 12
+LEAST, PIECE = 200, 0.1  # pixels of an object that is asked about, in an image of 640 x 480; share of a piece
+TOUCH = 5  # pixels: windows in which two objects touch
+Rows = list[dict[str, object]]
+
+
+class Labelled(NamedTuple):
+    """An image with the true object of each pixel; 0 is none, -1 is unknown."""
+
+    group: str
+    name: str
+    frame: Frame
+    grid: VoxelGrid
+    labels: np.ndarray
+
+
+def real_images() -> Iterator[tuple[str, Labelled]]:
+    """Data set and image of every labelled pause of HOTS and OSD."""
+    for sequence in sequences(SHARED):
+        if sequence.source in ("hots", "osd"):
+            for clip in sequence.recording.clips():
+                labels = sequence.truth(clip.index).labels
+                yield sequence.source, Labelled(sequence.source, sequence.name, clip.after, clip.grid, labels)
+
+
+def simulated_images(families: list[str], seeds: range) -> Iterator[Labelled]:
+    """The first pauses of scenes."""
+    for name in families:
+        for seed in seeds:
+            try:
+                scene = SimulatedScene(replace(SCENE_FAMILIES[name], n_actions=0), seed)
+            except InputError as error:  # the objects do not fit
+                print(name, seed, error, flush=True)
+                continue
+            seen = scene.frame_images(0)
+            frame = Frame(seen["rgb"], seen["depth"], scene.camera)
+            yield Labelled(name, f"{name} {seed}", frame, scene.grid, seen["instance"].astype(np.int64))
+
+
+def write_samples(folder: Path) -> None:
+    """A file of samples for each sequence."""
+    found: dict[str, list[SeamSamples]] = {}
+    for k, (_, image) in enumerate(real_images()):
+        tree = BorderTree(weights=border_model(image.name))
+        try:
+            samples = SeamSamples.of_frame(image.frame, image.grid, image.labels, k, tree)
+        except InputError as error:
+            print(image.name, k, error, flush=True)
+            continue
+        found.setdefault(image.name, []).append(samples)
+        scene_cache.clear()
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, parts in found.items():
+        SeamSamples.join(parts).save(folder / f"{name}.npz")
+        print(name, sum(len(np.unique(part.region)) for part in parts), "regions", flush=True)
+
+
+def scored(image: Labelled, proposal: TreeCutProposal, rng: np.random.Generator) -> dict[str, float]:
+    """The scores of a proposal in an image."""
+    began = time.process_time()
+    tree, w = proposal.tree_of(image.frame, image.grid)
+    seconds = time.process_time() - began
+    known = image.labels >= 0
+    labels = np.where(known, image.labels, 0)
+    cuts = [optimal_cut(tree, w), *ExactCuts().sample(np.random.default_rng(0), tree, w, DRAWS).cuts]
+    images = [np.where(known, proposal.objects.label_image(tree, c, image.frame, image.grid), 0) for c in cuts]
+    quality = [weighted_coverage(found, labels) for found in images]
+    least = scaled_area(LEAST, labels.size)
+    objects = [int(k) for k in np.flatnonzero(np.bincount(labels.ravel()) >= least) if k > 0]
+    draws = np.stack([found.ravel() for found in images[1:]])
+    pixels = {k: np.flatnonzero(labels.ravel() == k) for k in objects}
+    main, split = {}, []
+    for k, own in pixels.items():
+        counts = [np.bincount(row[own]) for row in draws]
+        main[k] = np.array([int(n[1:].argmax()) + 1 if len(n) > 1 else 0 for n in counts])
+        split.append(np.mean([(n[1:] > PIECE * len(own)).sum() > 1 for n in counts]))
+    touching = touching_pairs(labels, objects)
+    merged = [np.mean((main[a] == main[b]) & (main[a] > 0)) for a, b in touching]
+    a = [rng.choice(own, PAIRS) for own in pixels.values()] + [rng.choice(pixels[k], PAIRS) for k, _ in touching]
+    b = [rng.choice(own, PAIRS) for own in pixels.values()] + [rng.choice(pixels[k], PAIRS) for _, k in touching]
+    first, second = (draws[:, np.concatenate(part)] for part in (a, b))
+    both = (first > 0) & (second > 0)
+    forecast = ((first == second) & both).sum(axis=0) / np.maximum(both.sum(axis=0), 1)
+    same = np.repeat([1.0] * len(pixels) + [0.0] * len(touching), PAIRS)
+    p = SOFTENING + (1 - 2 * SOFTENING) * forecast
+    asked = both.any(axis=0)
+    loss = -np.log(np.where(same > 0, p, 1 - p))[asked]
+    return {
+        "objects": len(objects),
+        "pairs": len(touching),
+        "quality_optimal": quality[0],
+        "quality": float(np.mean(quality[1:])),
+        "merged": float(np.mean(merged)) if merged else np.nan,
+        "split": float(np.mean(split)),
+        "log_loss": float(loss.mean()),
+        "log_loss_same": float(loss[same[asked] > 0].mean()),
+        "log_loss_different": float(loss[same[asked] == 0].mean()) if merged else np.nan,
+        "seconds": seconds,
+    }
+
+
+def touching_pairs(labels: np.ndarray, objects: list[int]) -> list[tuple[int, int]]:
+    """The pairs of objects that are neighbours in the image."""
+    shown = np.where(np.isin(labels, objects), labels, 0)
+    high = maximum_filter(shown, TOUCH)
+    low = minimum_filter(np.where(shown > 0, shown, shown.max() + 1), TOUCH)
+    at = (high > low) & (low > 0)
+    pairs, counts = np.unique(np.stack([low[at], high[at]]), axis=1, return_counts=True)
+    return [(int(a), int(b)) for (a, b), n in zip(pairs.T, counts, strict=True) if n >= 4 * TOUCH]
+
+
+def main(options: argparse.Namespace) -> None:
+    """Score the trees and write the tables."""
+    folds = dict(part.split("=") for part in options.fold.split(",")) if options.fold else {}
+    shares = [float(share) for share in options.shares.split(",")]
+    first, last = (int(n) for n in (options.seeds.split("-") * 2)[:2])
+    rows: Rows = []
+    simulated = simulated_images([n for n in options.scenes.split(",") if n], range(first, last + 1))
+    images = [("", one) for one in simulated] if options.no_real else _chain(simulated, options.every)
+    for source, image in images:
+        base = BorderTree(weights=border_model(image.name) if source else "border")
+        judge = folds.get(source, options.judge)
+        trees: list[tuple[str, float, BorderTree | SeamTree]] = [] if options.no_base else [("border", np.nan, base)]
+        if judge:
+            trees += [("seams", share, SeamTree(base=base, weights=judge, one_share=share)) for share in shares]
+        for name, share, tree in trees:
+            found = scored(image, TreeCutProposal(tree=tree, objects=ObjectRule()), np.random.default_rng(0))
+            rounded = {key: round(value, 4) for key, value in found.items()}
+            rows.append({"group": image.group, "image": image.name, "tree": name, "one_share": share} | rounded)
+        scene_cache.clear()
+    options.out.mkdir(parents=True, exist_ok=True)
+    write_csv(options.out / "scores.csv", rows)
+    summary = summaries(rows)
+    write_csv(options.out / "summary.csv", summary)
+    for row in summary:
+        print(*row.values(), sep=", ")
+
+
+def _chain(simulated: Iterator[Labelled], every: int) -> Iterator[tuple[str, Labelled]]:
+    yield from (("", one) for one in simulated)
+    for k, found in enumerate(real_images()):
+        if k % every == 0:
+            yield found
+
+
+def summaries(rows: Rows) -> Rows:
+    """Means over the images of each group, and of each sequence of a real one."""
+    found: Rows = []
+    numbers = list(rows[0])[4:]
+    keys = dict.fromkeys((row["group"], name, row["tree"], row["one_share"]) for row in rows for name in ("all", row["image"]))
+    for group, name, tree, share in keys:
+        own = [
+            row
+            for row in rows
+            if (row["group"], row["tree"], str(row["one_share"])) == (group, tree, str(share))
+            and name in ("all", row["image"])
+        ]
+        if name == "all" or len(own) > 1:
+            means = {n: round(float(np.nanmean([row[n] for row in own])), 4) for n in numbers}  # type: ignore[list-item]
+            found.append({"group": group, "image": name, "tree": tree, "one_share": share, "images": len(own)} | means)
+    return list({str(list(row.values())[:4]): row for row in found}.values())
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True)
+    samples = commands.add_parser("samples")
+    samples.add_argument("folder", type=Path)
+    score = commands.add_parser("score")
+    score.add_argument("--out", type=Path, required=True)
+    score.add_argument("--judge", default="", help="model of the judge for simulated images; default: no judge")
+    score.add_argument("--fold", default="", help="hots=MODEL,osd=MODEL: judges that have not seen these frames")
+    score.add_argument("--shares", default="0.5", help="prior probabilities of one object")
+    score.add_argument("--scenes", default="s1,s2,s3")
+    score.add_argument("--seeds", default="0-9")
+    score.add_argument("--no-real", action="store_true")
+    score.add_argument("--no-base", action="store_true")
+    score.add_argument("--every", type=int, default=1, help="use every so many of the real frames")
+    score.add_argument("--smoke", action="store_true", help="one scene, no real image")
+    chosen = parser.parse_args()
+    if chosen.command == "samples":
+        write_samples(chosen.folder)
+    else:
+        if chosen.smoke:
+            chosen.scenes, chosen.seeds, chosen.no_real = "s1", "0", True
+        main(chosen)
