@@ -20,15 +20,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 from folds import border_model
-from scores import identities, image_scores, kept, witness_scores
+from scores import identities, image_scores, kept, pixel_log_loss, witness_scores
 from sequences import SHARED, Sequence, sequences
 
+from mstfilter import Belief
 from mstfilter.base.files import read_csv, write_csv
 from mstfilter.mst.segmentation import BorderTree
 from mstfilter.runs.presets import preset
-from mstfilter.scene import Clip, Hypothesis, outlined, project
+from mstfilter.scene import Camera, Clip, Hypothesis, outlined, project
 from mstfilter.scoring.statistics import compare
-from mstfilter.smc import State
+from mstfilter.smc import Population, State
 
 HERE = Path(__file__).resolve().parent
 
@@ -84,7 +85,7 @@ def run(
             own = Clip((clip.after,), clip.grid, 0) if name == "mst, no past" else clip
             start = f.start(seed) if name == "mst, no past" else states[name]
             began = time.process_time()
-            states[name], _ = f.step(start, own)
+            states[name], info = f.step(start, own)
             seconds = time.process_time() - began
             particles = states[name].population.particles
             images = [project(h, clip.after.camera) for h in particles]
@@ -103,9 +104,19 @@ def run(
             ]
             mean = {key: round(float(np.mean([row[key] for row in rows])), 4) for key in rows[0]}
             least = {"least_found": min(row["found"] for row in rows)}
+            losses = log_losses(Belief.of_step(states[name], info), clip.after.camera, truth.labels)
             followed = _kept(histories[name])
             about = {"sequence": sequence.name, "source": sequence.source, "pause": clip.index, "method": name}
-            yield about | mean | least | followed | {"seconds": round(seconds, 2)}
+            yield about | mean | losses | least | followed | {"seconds": round(seconds, 2)}
+
+
+def log_losses(belief: Belief, camera: Camera, labels: np.ndarray) -> dict[str, object]:
+    """`pixel_log_loss` of all that a method knows, of the hypotheses that it keeps, and of its one answer."""
+    if len(np.unique(labels[labels > 0])) < 2:
+        return {"log_loss": "", "log_loss_kept": "", "log_loss_answer": ""}
+    answer = Belief(Population([belief.estimate()]))
+    named = {"log_loss": belief, "log_loss_kept": belief.kept, "log_loss_answer": answer}
+    return {name: round(pixel_log_loss(one, camera, labels), 4) for name, one in named.items()}
 
 
 def _kept(lineages: list[list[dict[str, int]]]) -> dict[str, int]:

@@ -2,25 +2,32 @@
 
 >>> image_scores(image, truth, frame, grid)      # quality, pieces, merged, missed, invented, found
 >>> witness_scores(hypothesis, frame, witness)   # what a second camera says
+>>> pixel_log_loss(belief, camera, labels)       # of "do these two pixels show one object?"
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence as Several
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_dilation, maximum_filter, minimum_filter
 from sequences import WALL, Truth
 
-from mstfilter.scene import Frame, Hypothesis, VoxelGrid, frame_geometry
+from mstfilter import Belief
+from mstfilter.scene import Camera, Frame, Hypothesis, VoxelGrid, frame_geometry, scaled_area
 from mstfilter.scoring import weighted_coverage
+from mstfilter.scoring.forecasts import SOFTENING
 
 PIECE = 0.1  # share of a true object's pixels that an object needs to be a piece of it
 FOUND = 0.25  # share of a true object's pixels that objects must cover, else it is missed; likewise for invented ones
 TALL = 0.04  # metres above the table
 READABLE = 0.25  # share of an object's pixels that need a reading to count in `quality_readable`
 # Metres: witness surface above the table, behind depth 1, before depth 2; distance of surface of the wall.
+LEAST = 200  # pixels of an object that pairs of pixels are drawn from, in an image of 640 x 480
+PAIRS = 12  # of pixels, for each object and each pair of objects that touch
+_TOUCH = 5  # pixels: windows in which two objects touch
 _SEEN, _BEHIND, _FRONT, _AT_WALL = 0.03, 0.02, 0.03, 0.03
 
 
@@ -65,6 +72,55 @@ def image_scores(image: np.ndarray, truth: Truth, frame: Frame, grid: VoxelGrid)
         "tall_missed": float((tall & (covered[objects] < FOUND)).sum()),
         "found": float(shares[objects].max(axis=1, initial=0).mean()) if len(objects) else np.nan,
     }
+
+
+class PixelPairs(NamedTuple):
+    """Pairs of pixels and whether they show one object: within objects, and across borders of objects that touch."""
+
+    a: np.ndarray  #: (k,) flat pixels
+    b: np.ndarray  #: (k,)
+    same: np.ndarray  #: (k,) bool
+    objects: dict[int, np.ndarray]  #: flat pixels of each true object that is large enough
+    touching: list[tuple[int, int]]  #: true objects that are neighbours in the image
+
+    @classmethod
+    def of(cls, labels: np.ndarray) -> PixelPairs:
+        """Pairs from true labels (H, W); always the same ones."""
+        rng, flat = np.random.default_rng(0), labels.ravel()
+        sizes = np.bincount(np.maximum(flat, 0))
+        large = [int(k) for k in np.flatnonzero(sizes >= scaled_area(LEAST, labels.size)) if k > 0]
+        objects = {k: np.flatnonzero(flat == k) for k in large}
+        touching = touching_pairs(labels, large)
+        ends = [*((k, k) for k in objects), *touching]
+        a, b = (
+            np.concatenate([rng.choice(objects[pair[side]], PAIRS) for pair in ends] or [np.zeros(0, np.int64)])
+            for side in (0, 1)
+        )
+        return cls(a, b, np.repeat([i == j for i, j in ends], PAIRS), objects, touching)
+
+
+def touching_pairs(labels: np.ndarray, objects: Several[int]) -> list[tuple[int, int]]:
+    """The pairs of some objects that are neighbours in the image, along at least some pixels."""
+    shown = np.where(np.isin(labels, objects), labels, 0)
+    high = maximum_filter(shown, _TOUCH)
+    low = minimum_filter(np.where(shown > 0, shown, shown.max() + 1), _TOUCH)
+    at = (high > low) & (low > 0)
+    pairs, counts = np.unique(np.stack([low[at], high[at]]), axis=1, return_counts=True)
+    return [(int(a), int(b)) for (a, b), n in zip(pairs.T, counts, strict=True) if n >= 4 * _TOUCH]
+
+
+def pixel_log_loss(belief: Belief, camera: Camera, labels: np.ndarray) -> float:
+    """Mean log loss in nats of "do these two pixels show one object?", with forecasts softened by .02.
+
+    A pixel without an object shows none, so a missed object costs. NaN without objects.
+    """
+    pairs = PixelPairs.of(labels)
+    if not len(pairs.a):
+        return np.nan
+    rows = [np.divmod(flat, labels.shape[1]) for flat in (pairs.a, pairs.b)]
+    forecast = belief.same_object_at_pixels(camera, *(np.column_stack([c, r]) for r, c in rows))
+    p = SOFTENING + (1 - 2 * SOFTENING) * np.where(pairs.same, forecast, 1 - forecast)
+    return float(-np.log(p).mean())
 
 
 def _heights(frame: Frame, labels: np.ndarray, objects: np.ndarray) -> list[np.ndarray]:

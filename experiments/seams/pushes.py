@@ -119,7 +119,7 @@ def of_scene(rows: list[Row], most: int) -> Row:
 
 
 def summary(scenes: list[Row]) -> list[Row]:
-    """Mean numbers of pushes, and their ratios to those of `random`, of the scenes that are not decided by an image."""
+    """Mean numbers of pushes and their ratios to those of `random`; scenes that need no push are left out."""
     rng, found = np.random.default_rng(0), []
     table = {(str(r["policy"]), f"{r['family']} {r['seed']}"): float(r["pushes"]) for r in scenes}  # type: ignore[arg-type]
     names = [n for n in dict.fromkeys(n for _, n in table) if table.get(("random", n), 0) > 0]

@@ -15,8 +15,7 @@ image:
 - `quality`: weighted coverage in the image, of the optimal cut and mean of the draws.
 - `merged`: of pairs of true objects that touch in the image, the mean share of draws in which they have one segment.
 - `split`: of true objects, the mean share of draws in which a second segment has a tenth of their pixels.
-- `log_loss`: of the question whether two pixels belong to one object. Pairs of pixels are drawn within objects and
-  across the borders of touching objects, 12 for each; forecasts are softened by .02.
+- `log_loss`: of the question whether two pixels of objects show one, as in ../real/scores.py.
 
 scores.csv has a row for each image, tree and share; summary.csv the means by family or data set.
 """
@@ -32,25 +31,23 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import maximum_filter, minimum_filter
 
 from mst_training.seam_data import SeamSamples
 from mstfilter.base.errors import InputError
 from mstfilter.base.files import write_csv
 from mstfilter.lab.simulation import SCENE_FAMILIES, SimulatedScene
 from mstfilter.mst.segmentation import BorderTree, ExactCuts, ObjectRule, SeamTree, TreeCutProposal, optimal_cut
-from mstfilter.scene import Frame, VoxelGrid, scaled_area, scene_cache
+from mstfilter.scene import Frame, VoxelGrid, scene_cache
 from mstfilter.scoring import weighted_coverage
 from mstfilter.scoring.forecasts import SOFTENING
 
 REAL = Path(__file__).resolve().parent.parent / "real"
 sys.path.append(str(REAL))
 from folds import border_model  # noqa: E402
+from scores import PixelPairs  # noqa: E402
 from sequences import SHARED, sequences  # noqa: E402
 
-DRAWS, PAIRS = 30, 12
-LEAST, PIECE = 200, 0.1  # pixels of an object that is asked about, in an image of 640 x 480; share of a piece
-TOUCH = 5  # pixels: windows in which two objects touch
+DRAWS, PIECE = 30, 0.1  # draws for each image; share of the pixels of a true object in a piece of it
 Rows = list[dict[str, object]]
 
 
@@ -105,7 +102,7 @@ def write_samples(folder: Path) -> None:
         print(name, sum(len(np.unique(part.region)) for part in parts), "regions", flush=True)
 
 
-def scored(image: Labelled, proposal: TreeCutProposal, rng: np.random.Generator) -> dict[str, float]:
+def scored(image: Labelled, proposal: TreeCutProposal) -> dict[str, float]:
     """The scores of a proposal in an image."""
     began = time.process_time()
     tree, w = proposal.tree_of(image.frame, image.grid)
@@ -115,48 +112,32 @@ def scored(image: Labelled, proposal: TreeCutProposal, rng: np.random.Generator)
     cuts = [optimal_cut(tree, w), *ExactCuts().sample(np.random.default_rng(0), tree, w, DRAWS).cuts]
     images = [np.where(known, proposal.objects.label_image(tree, c, image.frame, image.grid), 0) for c in cuts]
     quality = [weighted_coverage(found, labels) for found in images]
-    least = scaled_area(LEAST, labels.size)
-    objects = [int(k) for k in np.flatnonzero(np.bincount(labels.ravel()) >= least) if k > 0]
+    pairs = PixelPairs.of(labels)
     draws = np.stack([found.ravel() for found in images[1:]])
-    pixels = {k: np.flatnonzero(labels.ravel() == k) for k in objects}
     main, split = {}, []
-    for k, own in pixels.items():
+    for k, own in pairs.objects.items():
         counts = [np.bincount(row[own]) for row in draws]
         main[k] = np.array([int(n[1:].argmax()) + 1 if len(n) > 1 else 0 for n in counts])
         split.append(np.mean([(n[1:] > PIECE * len(own)).sum() > 1 for n in counts]))
-    touching = touching_pairs(labels, objects)
-    merged = [np.mean((main[a] == main[b]) & (main[a] > 0)) for a, b in touching]
-    a = [rng.choice(own, PAIRS) for own in pixels.values()] + [rng.choice(pixels[k], PAIRS) for k, _ in touching]
-    b = [rng.choice(own, PAIRS) for own in pixels.values()] + [rng.choice(pixels[k], PAIRS) for _, k in touching]
-    first, second = (draws[:, np.concatenate(part)] for part in (a, b))
+    merged = [np.mean((main[a] == main[b]) & (main[a] > 0)) for a, b in pairs.touching]
+    first, second = draws[:, pairs.a], draws[:, pairs.b]
     both = (first > 0) & (second > 0)
-    forecast = ((first == second) & both).sum(axis=0) / np.maximum(both.sum(axis=0), 1)
-    same = np.repeat([1.0] * len(pixels) + [0.0] * len(touching), PAIRS)
-    p = SOFTENING + (1 - 2 * SOFTENING) * forecast
     asked = both.any(axis=0)
-    loss = -np.log(np.where(same > 0, p, 1 - p))[asked]
+    forecast = ((first == second) & both).sum(axis=0)[asked] / both.sum(axis=0)[asked]
+    same = pairs.same[asked]
+    loss = -np.log(SOFTENING + (1 - 2 * SOFTENING) * np.where(same, forecast, 1 - forecast))
     return {
-        "objects": len(objects),
-        "pairs": len(touching),
+        "objects": len(pairs.objects),
+        "pairs": len(pairs.touching),
         "quality_optimal": quality[0],
         "quality": float(np.mean(quality[1:])),
         "merged": float(np.mean(merged)) if merged else np.nan,
         "split": float(np.mean(split)),
         "log_loss": float(loss.mean()),
-        "log_loss_same": float(loss[same[asked] > 0].mean()),
-        "log_loss_different": float(loss[same[asked] == 0].mean()) if merged else np.nan,
+        "log_loss_same": float(loss[same].mean()),
+        "log_loss_different": float(loss[~same].mean()) if not same.all() else np.nan,
         "seconds": seconds,
     }
-
-
-def touching_pairs(labels: np.ndarray, objects: list[int]) -> list[tuple[int, int]]:
-    """The pairs of objects that are neighbours in the image."""
-    shown = np.where(np.isin(labels, objects), labels, 0)
-    high = maximum_filter(shown, TOUCH)
-    low = minimum_filter(np.where(shown > 0, shown, shown.max() + 1), TOUCH)
-    at = (high > low) & (low > 0)
-    pairs, counts = np.unique(np.stack([low[at], high[at]]), axis=1, return_counts=True)
-    return [(int(a), int(b)) for (a, b), n in zip(pairs.T, counts, strict=True) if n >= 4 * TOUCH]
 
 
 def main(options: argparse.Namespace) -> None:
@@ -174,7 +155,7 @@ def main(options: argparse.Namespace) -> None:
         if judge:
             trees += [("seams", share, SeamTree(base=base, weights=judge, one_share=share)) for share in shares]
         for name, share, tree in trees:
-            found = scored(image, TreeCutProposal(tree=tree, objects=ObjectRule()), np.random.default_rng(0))
+            found = scored(image, TreeCutProposal(tree=tree, objects=ObjectRule()))
             rounded = {key: round(value, 4) for key, value in found.items()}
             rows.append({"group": image.group, "image": image.name, "tree": name, "one_share": share} | rounded)
         scene_cache.clear()
@@ -197,7 +178,9 @@ def summaries(rows: Rows) -> Rows:
     """Means over the images of each group, and of each sequence of a real one."""
     found: Rows = []
     numbers = list(rows[0])[4:]
-    keys = dict.fromkeys((row["group"], name, row["tree"], row["one_share"]) for row in rows for name in ("all", row["image"]))
+    keys = dict.fromkeys(
+        (row["group"], name, row["tree"], row["one_share"]) for row in rows for name in ("all", row["image"])
+    )
     for group, name, tree, share in keys:
         own = [
             row
@@ -207,7 +190,9 @@ def summaries(rows: Rows) -> Rows:
         ]
         if name == "all" or len(own) > 1:
             means = {n: round(float(np.nanmean([row[n] for row in own])), 4) for n in numbers}  # type: ignore[list-item]
-            found.append({"group": group, "image": name, "tree": tree, "one_share": share, "images": len(own)} | means)
+            found.append(
+                {"group": group, "image": name, "tree": tree, "one_share": share, "images": len(own)} | means
+            )
     return list({str(list(row.values())[:4]): row for row in found}.values())
 
 

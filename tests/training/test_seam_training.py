@@ -81,7 +81,9 @@ def test_purity():
     visible = np.bincount(np.repeat([0, 1, 2, 3], (50, 400, 300, 900)), minlength=256)
     sides = {"clean": instance == 1, "half": np.arange(len(instance)) % 2 == 0, "one object": instance == 0}
     sides["oblique"] = np.arange(len(instance)) < 400
-    found, n = _purity(instance, [Division(side, "tree", np.zeros(3), 0.0, 1.0, 0.0) for side in sides.values()], visible)
+    found, n = _purity(
+        instance, [Division(side, "tree", np.zeros(3), 0.0, 1.0, 0.0) for side in sides.values()], visible
+    )
     assert n == 2
     assert dict(zip(sides, found, strict=True)) == pytest.approx(
         {"clean": 1.0, "half": 0.0, "one object": 0.0, "oblique": 650 / 700}

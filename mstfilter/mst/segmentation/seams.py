@@ -152,7 +152,9 @@ class BaseTree:
                 found.append(merge)
                 stack += merge[:2]
         found = sorted(found, key=lambda merge: -merge[2])[:_MOST_MERGES]
-        return [Part(self.regions_of(child), odds) for *children, odds in found if odds >= _KNOWN for child in children]
+        return [
+            Part(self.regions_of(child), odds) for *children, odds in found if odds >= _KNOWN for child in children
+        ]
 
 
 class _Examination:
