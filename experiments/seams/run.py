@@ -7,8 +7,8 @@
 
 Both need the data in MSTFILTER_SHARED (default ../shared) under real/; `score` works without.
 
-`score` compares the trees `border` and `seams` on label images: the first pauses of simulated scenes, and all labelled
-pauses of HOTS and OSD. On real images the border model and the judge are those of a fold: neither was trained or
+`score` compares the trees `border` and `seams` on label images: the first pauses of simulated scenes, and all
+labelled pauses of HOTS and OSD. On real images the border model and the judge are those of a fold: neither was trained or
 fitted with frames of that camera set-up (of the border model for OSD: of that group). With 30 exact draws for each
 image:
 

@@ -24,6 +24,7 @@ from torch import Tensor, nn
 from mst_training.loop import Training
 from mst_training.scenes import Samples
 from mst_training.seam_data import SeamSamples
+from mstfilter.base.errors import InputError
 from mstfilter.mst.segmentation.seam_measures import STRIP_CHANNELS
 from mstfilter.mst.segmentation.seam_network import INPUTS, SEAM_ARCHITECTURE, SeamNet, decoded
 from mstfilter.scoring.forecasts import ForecastTable
