@@ -8,9 +8,8 @@
 Both need the data in MSTFILTER_SHARED (default ../shared) under real/; `score` works without.
 
 `score` compares the trees `border` and `seams` on label images: the first pauses of simulated scenes, and all
-labelled pauses of HOTS and OSD. On real images the border model and the judge are those of a fold: neither was trained or
-fitted with frames of that camera set-up (of the border model for OSD: of that group). With 30 exact draws for each
-image:
+labelled pauses of HOTS and OSD. On real images the border model and the judge are those of a fold, so neither was
+fitted to frames of that camera set-up (the border model, for OSD: of that group). With 30 exact draws for each image:
 
 - `quality`: weighted coverage in the image, of the optimal cut and mean of the draws.
 - `merged`: of pairs of true objects that touch in the image, the mean share of draws in which they have one segment.

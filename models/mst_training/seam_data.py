@@ -155,7 +155,8 @@ def _regions(
     measures = SeamMeasures.of(image, regions.image > 0)
     flat = instance.ravel()
     visible = np.bincount(flat[regions.image.ravel() > 0], minlength=256)
-    for node in base.uncertain():
+    clear = base.clear()
+    for node in [*clear, *base.uncertain()]:
         todo = [(*base.region(node), 0)]
         while todo:
             pixels, parts, depth = todo.pop()
@@ -167,7 +168,7 @@ def _regions(
             if n == 0 or (n == 1 and depth == 0 and rng.uniform() > _PLAIN[grouped]):
                 continue
             yield (*measures.describe(pixels, divided), purity, n, depth, grouped)
-            if depth < _MOST_DEPTH:
+            if depth < _MOST_DEPTH and node not in clear:
                 best = int(purity.argmax())
                 if n > 1 and purity[best] > _PURE:
                     side = divided[best].side

@@ -1,11 +1,12 @@
 """A segmentation tree in which both readings of an ambiguous region exist: one object, or two that touch.
 
 A tree of merged regions follows the borders that can be seen. Two boxes side by side may show none, so such a tree
-has no node for each of them, and no sample of it can be right if they are two. `SeamTree` therefore looks again at
-the regions that its base tree joins, or divides with little certainty. It collects the ways to divide each
-(`mstfilter.mst.segmentation.divisions`), and a small network, the judge, gives the probabilities of "one object" and
-of each division. The most probable division becomes the first of the tree below this region, with the log odds of
-"not one" as its odds; the two sides are then examined in the same way.
+has no node for each of them, and no sample of it can be right if they are two. A box with two prints shows a border
+that is none. `SeamTree` therefore looks again at the regions that its base tree joins, or divides without certainty.
+It collects the ways to divide each (`mstfilter.mst.segmentation.divisions`), and a small network, the judge, gives the
+probabilities of "one object" and of each division. The most probable division becomes the first of the tree below this
+region, with the log odds of "not one" as its odds; the two sides are then examined in the same way. Where the base
+tree has a clear division, this stays, and only its odds are those of the judge.
 
 >>> tree = SeamTree().build(boundary, frame)
 >>> w = MergeLogOdds().values(tree, frame)
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from mstfilter.mst.segmentation.seam_network import SeamNetwork
 
 _CERTAIN = 7.0  # log odds: merges of the base tree above this stay as they are
+_CLEAR = 3.0  # log odds: above this the sides of a merge stay, and only its odds are judged
 _KNOWN = -6.0  # log odds: merges of the base tree below this are no divisions to examine
 _SURE = -5.0  # most log odds of merges inside a region that is judged to be one object
 _LEAST_PIXELS = 400  # of a region that is examined, in an image of 640 x 480
@@ -111,16 +113,25 @@ class BaseTree:
         joined = {child for a, b, _ in self.merges for child in (a, b)}
         return [node for node in range(1, self.n + len(self.merges)) if node not in joined]
 
+    def clear(self) -> list[int]:
+        """The nodes with a clear division, of which only the odds are judged."""
+        return [node for node in self._divided() if self.merges[node - self.n][2] <= _CERTAIN]
+
     def uncertain(self) -> list[int]:
-        """The largest nodes whose merge is not sure to join different objects: the regions that are examined."""
+        """The largest nodes without a clear division: the regions whose divisions are looked for."""
+        divided = self._divided()
+        below = [*self.top(), *(child for node in divided for child in self.merges[node - self.n][:2])]
+        return sorted(set(below) - set(divided))
+
+    def _divided(self) -> list[int]:
+        """The nodes, from above, whose merge and all merges above are clear or certain to join different objects."""
         found, stack = [], self.top()
         while stack:
             merge = self.merge_of(node := stack.pop())
-            if merge is not None and merge[2] > _CERTAIN:
-                stack += merge[:2]
-            else:
+            if merge is not None and merge[2] > _CLEAR:
                 found.append(node)
-        return sorted(found)
+                stack += merge[:2]
+        return found
 
     def region(self, node: int) -> tuple[np.ndarray, list[Part]]:
         """The flat pixels (n,) below a node, and the parts of it that the tree knows."""
@@ -170,7 +181,7 @@ class _Examination:
     ) -> None:
         self.builder, self.judge, self.image = builder, judge, image
         self.base = BaseTree(regions.image, len(regions.sums), merges)
-        self.uncertain = frozenset(self.base.uncertain())
+        self.clear, self.uncertain = frozenset(self.base.clear()), frozenset(self.base.uncertain())
         self.flat = regions.image.ravel()
         self.measures = SeamMeasures.of(image, regions.image > 0)
         self.prior = log(builder.one_share / (1 - builder.one_share))
@@ -203,6 +214,10 @@ class _Examination:
         merge = self.base.merge_of(node)
         assert merge is not None
         a, b, odds = merge
+        if node in self.clear:
+            pixels, parts = self.base.region(node)
+            if len(pixels) >= self.least and (found := divisions(self.image, pixels, parts)):
+                odds = self._judged(pixels, found)[0]
         return self._join(self._upper(a), self._upper(b), odds)
 
     def _examined(self, node: int, pixels: np.ndarray, parts: Sequence[Part], depth: int) -> tuple[str, int]:
