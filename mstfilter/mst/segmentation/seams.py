@@ -3,10 +3,10 @@
 A tree of merged regions follows the borders that can be seen. Two boxes side by side may show none, so such a tree
 has no node for each of them, and no sample of it can be right if they are two. A box with two prints shows a border
 that is none. `SeamTree` therefore looks again at the regions that its base tree joins, or divides without certainty.
-It collects the ways to divide each (`mstfilter.mst.segmentation.divisions`), and a small network, the judge, gives the
-probabilities of "one object" and of each division. The most probable division becomes the first of the tree below this
-region, with the log odds of "not one" as its odds; the two sides are then examined in the same way. Where the base
-tree has a clear division, this stays, and only its odds are those of the judge.
+It collects the ways to divide each (`mstfilter.mst.segmentation.divisions`), and a small network, the judge, gives
+the probabilities of "one object" and of each division. The most probable division becomes the first of the tree
+below this region, with the log odds of "not one" as its odds; the two sides are then examined in the same way. Where
+the base tree has a clear division, this stays, and only its odds are those of the judge.
 
 >>> tree = SeamTree().build(boundary, frame)
 >>> w = MergeLogOdds().values(tree, frame)
