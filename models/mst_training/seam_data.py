@@ -5,8 +5,8 @@
 
 Half of the scenes ask the question: in `row`, `stack` and `pack`, things that look like several objects are one as
 often as not. The others are `s1` to `s3`. Cameras and sensors are drawn at random, sizes and textures are those for
-tuning. The regions are those that `SeamTree` examines in the tree `border`, and below them the sides of the best
-division, or of a random one. Some of the regions that plainly are one object are left out.
+tuning. The regions are those that `SeamTree` examines in the tree `border`, and below those of several objects the
+sides of the best division. Some of the regions that plainly are one object are left out.
 
 Real images with label images give samples in the same way:
 
@@ -45,7 +45,7 @@ _WHOLE = 0.7  # share of each object that must be on one side of a division that
 _PLAIN = {True: 0.85, False: 0.65}  # share of the regions of one object that are used, in scenes with groups or not
 _KNOWN = 0.7  # least share of the pixels of a region that must belong to objects
 _MOST_DEPTH = 3
-_PURE, _AT_RANDOM = 0.93, 0.15  # divisions that are followed: such pure ones, and this share of the others
+_PURE, _AT_RANDOM = 0.93, 0.15  # divisions of several objects that are followed: pure ones, this share of others
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,12 +167,12 @@ def _regions(
                 continue
             if n == 0 or (n == 1 and depth == 0 and rng.uniform() > _PLAIN[grouped]):
                 continue
-            yield (*measures.describe(pixels, divided), purity, n, depth, grouped)
+            yield (*measures.describe(pixels, divided, depth > 0), purity, n, depth, grouped)
             if depth < _MOST_DEPTH and node not in clear:
                 best = int(purity.argmax())
                 if n > 1 and purity[best] > _PURE:
                     side = divided[best].side
-                elif rng.uniform() < _AT_RANDOM:
+                elif n > 1 and rng.uniform() < _AT_RANDOM:
                     side = divided[int(rng.integers(len(divided)))].side
                 else:
                     continue

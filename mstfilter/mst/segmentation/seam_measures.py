@@ -41,7 +41,7 @@ SEAM_FEATURES = (
     *("seam evidence", "seam low evidence", "seam strong share", "region evidence", "seam border"),
     *("step along", "top gap", "bottom gap", "near end", "far end"),
     *("hull gain", "solid region", "solid sides", "ground hull gain", "rectangle gain"),
-    *("tree overlap", "tree odds"),
+    *("tree overlap", "tree odds", "divided above"),
 )
 _LEVELS = 128.0  # a strip stores x as rint(x * 64) + 128, so -2 .. 1.98 in 256 levels
 _REACH = 1.3  # a strip is so many times as long as its seam
@@ -99,10 +99,16 @@ class SeamMeasures:
         half = [cv2.resize(part, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for part in full]
         return [full, half]
 
-    def describe(self, pixels: np.ndarray, found: list[Division]) -> tuple[np.ndarray, np.ndarray]:
-        """Features (k, f) float32 and strips (k, c, *STRIP) uint8 of divisions of a region with flat pixels (n,)."""
+    def describe(
+        self, pixels: np.ndarray, found: list[Division], below: bool = False
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Features (k, f) float32 and strips (k, c, *STRIP) uint8 of divisions of a region with flat pixels (n,).
+
+        `below` says that the region is a side of another division. Of six equal boxes, three are more probably
+        several objects if the six are.
+        """
         region = _Region(self, pixels)
-        x = np.column_stack([region.pair_features(found), region.seam_features(found)])
+        x = np.column_stack([region.pair_features(found), region.seam_features(found, below)])
         strips = np.stack([region.strip(division) for division in found])
         return x.astype(np.float32), strips
 
@@ -163,7 +169,7 @@ class _Region:
                 found.append(np.column_stack([self.columns[k], self.rows[k]]))
         return np.concatenate(found)
 
-    def seam_features(self, found: list[Division]) -> np.ndarray:
+    def seam_features(self, found: list[Division], below: bool) -> np.ndarray:
         """`SEAM_FEATURES` (k, f)."""
         evidence = self.image.evidence
         w = evidence.shape[1]
@@ -201,7 +207,7 @@ class _Region:
                     float(np.log(n / hulls[:, 0].sum())),
                     float(np.log(all_ground / max(hulls[:, 1].sum(), 1e-6))),
                     float(np.log(all_box / max(hulls[:, 2].sum(), 1e-6))),
-                    *(division.overlap, division.odds),
+                    *(division.overlap, division.odds, float(below)),
                 ]
             )
         return np.array(rows)

@@ -217,14 +217,14 @@ class _Examination:
         if node in self.clear:
             pixels, parts = self.base.region(node)
             if len(pixels) >= self.least and (found := divisions(self.image, pixels, parts)):
-                odds = self._judged(pixels, found)[0]
+                odds = self._judged(pixels, found, False)[0]
         return self._join(self._upper(a), self._upper(b), odds)
 
     def _examined(self, node: int, pixels: np.ndarray, parts: Sequence[Part], depth: int) -> tuple[str, int]:
         """The subtree of some pixels (n,) below a node of the base tree; `parts` are those of `divisions`."""
         if depth <= _MOST_DEPTH and len(pixels) >= self.least:
             found = divisions(self.image, pixels, parts)
-            log_odds, best = self._judged(pixels, found)
+            log_odds, best = self._judged(pixels, found, depth > 0)
             if log_odds > np.log(self.builder.least / (1 - self.builder.least)):
                 # The sides of an improbable division are seldom in a sample, so they are not examined.
                 depth = depth + 1 if log_odds > _FOLLOWED else _MOST_DEPTH + 1
@@ -233,11 +233,11 @@ class _Examination:
                 return self._join(below[0], below[1], float(log_odds))
         return self._kept(node, pixels)
 
-    def _judged(self, pixels: np.ndarray, found: list[Division]) -> tuple[float, int]:
+    def _judged(self, pixels: np.ndarray, found: list[Division], below: bool) -> tuple[float, int]:
         """Log odds of "several objects" against "one", and the index of the most probable division."""
         if not found:
             return -np.inf, -1
-        scores = self.judge.scores(*self.measures.describe(pixels, found))
+        scores = self.judge.scores(*self.measures.describe(pixels, found, below))
         return float(np.logaddexp.reduce(scores)) - self.prior, int(scores.argmax())
 
     def _kept(self, node: int, pixels: np.ndarray) -> tuple[str, int]:

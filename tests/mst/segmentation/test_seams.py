@@ -146,7 +146,7 @@ def test_both_sides_of_the_true_seam_are_nodes(touching, judges, monkeypatch):
     label = np.zeros(frame.depth.size, int)
     label[pixels] = truth
 
-    def knowing(self, pixels, found):
+    def knowing(self, pixels, found, below):
         """The judge that knows the objects: even odds where there are two."""
         if min(np.bincount(label[pixels], minlength=3)[1:]) < 0.1 * len(pixels):
             return -20.0, -1
