@@ -39,7 +39,7 @@ _MOST_POINTS = 2500  # readings that vote for planes
 _UNKNOWN = -8.0  # log odds, and the largest size of them: a tree without a merge that resembles a division
 
 
-class Part(NamedTuple):
+class TreePart(NamedTuple):
     """A part of a region that a segmentation tree knows."""
 
     side: np.ndarray  #: (n,) bool, its pixels among those of the region
@@ -75,7 +75,7 @@ class SeamImage:
         return cls(frame, points, evidence.astype(np.float32), boundary, seen)
 
 
-def divisions(image: SeamImage, pixels: np.ndarray, parts: Sequence[Part] = ()) -> list[Division]:
+def divisions(image: SeamImage, pixels: np.ndarray, parts: Sequence[TreePart] = ()) -> list[Division]:
     """The divisions of the region with the flat `pixels` (n,); see the module.
 
     `parts` are those of the region that a tree knows, in order of importance. Divisions that are nearly equal occur
@@ -114,7 +114,7 @@ def _least(image: SeamImage, n: int) -> float:
 class _Distinct:
     """Divisions that differ from one another."""
 
-    def __init__(self, parts: Sequence[Part], n: int, least: float) -> None:
+    def __init__(self, parts: Sequence[TreePart], n: int, least: float) -> None:
         self.parts, self.n, self.least = parts, n, least
         self.divisions: list[Division] = []
 

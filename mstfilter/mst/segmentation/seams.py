@@ -26,7 +26,7 @@ import numpy as np
 
 from mstfilter.base.errors import InputError
 from mstfilter.base.fields import Bounds, Share
-from mstfilter.mst.segmentation.divisions import Division, Part, SeamImage, divisions
+from mstfilter.mst.segmentation.divisions import Division, SeamImage, TreePart, divisions
 from mstfilter.mst.segmentation.learned_tree import BorderTree, tree_of_merges
 from mstfilter.mst.segmentation.regions import Regions
 from mstfilter.mst.segmentation.seam_measures import SeamMeasures
@@ -95,9 +95,9 @@ def least_examined(size: int) -> float:
     return scaled_area(_LEAST_PIXELS, size)
 
 
-def within(parts: Sequence[Part], side: np.ndarray) -> list[Part]:
+def within(parts: Sequence[TreePart], side: np.ndarray) -> list[TreePart]:
     """The parts of one side (n,) bool of a region."""
-    return [Part(part.side[side], part.odds) for part in parts]
+    return [TreePart(part.side[side], part.odds) for part in parts]
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,11 +133,11 @@ class BaseTree:
                 stack += merge[:2]
         return found
 
-    def region(self, node: int) -> tuple[np.ndarray, list[Part]]:
+    def region(self, node: int) -> tuple[np.ndarray, list[TreePart]]:
         """The flat pixels (n,) below a node, and the parts of it that the tree knows."""
         flat = self.image.ravel()
         pixels = np.flatnonzero(self.regions_of(node)[flat])
-        return pixels, [Part(part.side[flat[pixels]], part.odds) for part in self.parts(node)]
+        return pixels, [TreePart(part.side[flat[pixels]], part.odds) for part in self.parts(node)]
 
     def merge_of(self, node: int) -> tuple[int, int, float] | None:
         """The merge that makes a node, None for a region."""
@@ -155,7 +155,7 @@ class BaseTree:
                 stack += self.merges[one - self.n][:2]
         return found
 
-    def parts(self, node: int) -> list[Part]:
+    def parts(self, node: int) -> list[TreePart]:
         """The sides, as regions (n,) bool, of the merges below a node that may divide objects, most divided first."""
         found, stack = [], [node]
         while stack:
@@ -164,7 +164,10 @@ class BaseTree:
                 stack += merge[:2]
         found = sorted(found, key=lambda merge: -merge[2])[:_MOST_MERGES]
         return [
-            Part(self.regions_of(child), odds) for *children, odds in found if odds >= _KNOWN for child in children
+            TreePart(self.regions_of(child), odds)
+            for *children, odds in found
+            if odds >= _KNOWN
+            for child in children
         ]
 
 
@@ -220,7 +223,7 @@ class _Examination:
                 odds = self._judged(pixels, found, False)[0]
         return self._join(self._upper(a), self._upper(b), odds)
 
-    def _examined(self, node: int, pixels: np.ndarray, parts: Sequence[Part], depth: int) -> tuple[str, int]:
+    def _examined(self, node: int, pixels: np.ndarray, parts: Sequence[TreePart], depth: int) -> tuple[str, int]:
         """The subtree of some pixels (n,) below a node of the base tree; `parts` are those of `divisions`."""
         if depth <= _MOST_DEPTH and len(pixels) >= self.least:
             found = divisions(self.image, pixels, parts)

@@ -10,7 +10,7 @@ from hypothesis import given, settings, strategies as st
 from mstfilter.base.errors import InputError
 from mstfilter.base.trained import write_model
 from mstfilter.mst.segmentation import ColourDepthBoundary, MergeLogOdds, SeamTree, SeenBorders, optimal_cut
-from mstfilter.mst.segmentation.divisions import Part, SeamImage, divisions
+from mstfilter.mst.segmentation.divisions import SeamImage, TreePart, divisions
 from mstfilter.mst.segmentation.learned_tree import FEATURES, pair_features
 from mstfilter.mst.segmentation.regions import measure_regions
 from mstfilter.mst.segmentation.seam_measures import SEAM_FEATURES, STRIP, STRIP_CHANNELS, SeamMeasures
@@ -62,7 +62,7 @@ def test_planes_contain_the_true_division(touching):
 def test_parts_of_a_tree_come_first_and_once(touching):
     _, image, pixels, truth = touching
     own = truth == 1
-    found = divisions(image, pixels, [Part(side, 1.5) for side in (own, ~own, np.zeros(len(pixels), bool))])
+    found = divisions(image, pixels, [TreePart(side, 1.5) for side in (own, ~own, np.zeros(len(pixels), bool))])
     assert found[0].kind == "tree" and (found[0].side == own).all()
     assert [one.kind for one in found].count("tree") == 1
     assert (found[0].overlap, found[0].odds) == (1.0, 1.5)
@@ -74,7 +74,7 @@ def test_features_of_the_sides_are_those_of_measured_regions(touching):
     frame, image, pixels, truth = touching
     objects = np.zeros(frame.depth.shape, bool)
     objects.ravel()[pixels] = True
-    found = divisions(image, pixels, [Part(truth == 1, 1.5)])
+    found = divisions(image, pixels, [TreePart(truth == 1, 1.5)])
     x, strips = SeamMeasures.of(image, objects).describe(pixels, found)
     assert x.shape == (len(found), len(INPUTS)) and np.isfinite(x).all()
     assert strips.shape == (len(found), len(STRIP_CHANNELS), *STRIP)
@@ -92,7 +92,7 @@ def test_strips_follow_the_seam(touching):
     frame, image, pixels, truth = touching
     objects = np.zeros(frame.depth.shape, bool)
     objects.ravel()[pixels] = True
-    found = divisions(image, pixels, [Part(truth == 1, 1.5)])
+    found = divisions(image, pixels, [TreePart(truth == 1, 1.5)])
     _, strips = SeamMeasures.of(image, objects).describe(pixels, found[:1])
     first, second = (strips[0, k].astype(float) - 128 for k in (0, 1))
     left, right = np.s_[16:48, :11], np.s_[16:48, 13:]
