@@ -7,8 +7,8 @@
 ``mst`` is the default, ``paper`` the published algorithm, and ``authors`` the program of its authors. A preset is a
 TOML file with the fields of `ParticleFilter`, one table for each component, and it can extend another one, so that it
 lists only the differences. The files are in ``models/`` beside the package (installed as ``mstfilter/_models``);
-``base.toml`` there has what `mst` and its baselines share; without an update, it is no
-preset by itself. In a file that extends another,
+``base.toml`` there has what `mst` and its baselines share; as it has no update, it is no preset by itself. In a file
+that extends another,
 
 =======================================  =============================================================================
 ``base = "base"``                        fields that are not named in the file are those of the base

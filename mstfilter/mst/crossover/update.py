@@ -126,9 +126,9 @@ class CrossoverUpdate(Update):
     Parameters
     ----------
     free_space : Projection
-        Projects predicted hypotheses onto hypotheses that agree with the latest frame.
+        Projects predictions onto hypotheses that agree with the latest frame.
     crossover : Crossover
-        Makes one hypothesis from two hypotheses.
+        Makes one hypothesis of two.
     eta : int
         Number of candidates of each pair of a sample and a prediction.
     quality_exponent : float
@@ -147,7 +147,7 @@ class CrossoverUpdate(Update):
     ) -> Population:
         """The candidates of all pairs of a sample and a prediction. Each candidate is built at its first access.
 
-        Without a prediction, the proposed samples are returned. Without a proposal, refined predictions are returned.
+        Without a prediction, they are the samples, and without a proposal, the projected predictions.
         """
         if predicted is None:
             return union(None, proposed)

@@ -131,11 +131,11 @@ def nested_masks(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Make masks with arbitrary overlaps disjoint or nested, and return masks and scores.
 
-    Use this function for automatic mask generators. Masks are processed in order of decreasing score, and each mask
-    is compared with all kept masks. Two masks are neighbours if they share at most ``1 - share`` of the smaller mask.
-    Two masks are nested if they share at least `share` of the smaller mask, and the smaller area is less than `share`
-    of the larger area. Otherwise the mask with the lower score is removed. In nested pairs, the smaller mask loses
-    the pixels outside the larger mask. Common pixels of neighbours belong to the mask with the higher score.
+    This is for automatic mask generators. Masks are taken in order of decreasing score, and each is compared with all
+    that are kept. Two masks are neighbours if they share at most ``1 - share`` of the smaller one; their common
+    pixels then belong to the one with the higher score. They are nested if they share at least `share` of the smaller
+    one and its area is less than `share` of the larger; it then loses the pixels outside the larger. Otherwise the
+    mask with the lower score is removed.
     """
     check_number("share", share, above=0.5, at_most=1)
     masks = np.asarray(masks, dtype=bool)

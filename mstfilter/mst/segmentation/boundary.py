@@ -59,11 +59,10 @@ class ColourDepthBoundary(BoundaryModel):
     Parameters
     ----------
     colour_weight : float
-        Weight of the colour edges. The weight 0 disables colour.
+        Weight of the colour edges; 0 disables colour.
     quiet_table : float
-        Distance in pixels of a 640 px wide image. The boundary is 0 at pixels farther than `quiet_table` from all
-        surfaces above the table, so print and shadows on the table are ignored. With a negative distance, no pixel is
-        set to 0.
+        The boundary is 0 at pixels farther than this from all surfaces above the table, in pixels of a 640 px wide
+        image, so print and shadows on the table are ignored. A negative distance disables this.
     """
 
     colour_weight: float = 0.4
