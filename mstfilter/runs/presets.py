@@ -56,7 +56,7 @@ def preset(name: str = "mst", *overrides: str, allow_files: bool = True) -> Part
         The preset, such as "mst", or the path of a TOML file.
     *overrides : str
         Changes ``path=value``, such as "n=10", "resampler=systematic" or "transition.rule=paper". Naming a component
-        resets its fields. A component of your own is ``./mine.py:Mine``, the file of which is executed.
+        resets its fields; one of your own is ``./mine.py:Mine``, and the file is executed.
     allow_files : bool
         Whether components may be named by files.
 

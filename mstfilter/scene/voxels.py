@@ -386,8 +386,8 @@ class Hypothesis:
     def with_labels(self, labels: np.ndarray) -> Hypothesis:
         """A hypothesis with the same objects and a new label grid.
 
-        The fields `source` and `motion` of objects with changed voxels are reset. Objects without voxels are removed.
-        Raises InputError if a label has no `ObjectRecord`.
+        Objects whose voxels change lose their `source` and `motion`, and those without voxels are removed. Raises
+        InputError if a label has no `ObjectRecord`.
         """
         labels = labels_on(self.grid, labels)
         different = labels != self.labels

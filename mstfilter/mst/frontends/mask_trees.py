@@ -6,13 +6,13 @@
 >>> w = node_values(tree, stop)
 >>> ExactCuts(temperature=1).sample(rng, tree, w, 10)                        # the object in 60 % of the cuts
 
-Two masks of a set are disjoint, or one mask contains the other. Leaf 0 of the tree has the pixels without a mask. If
-a mask contains masks, its remaining pixels are also a leaf. The root is the whole image and is never in a cut.
+Two masks of a set are disjoint, or one contains the other. Leaf 0 of the tree has the pixels without a mask, and if a
+mask contains masks, its remaining pixels are a leaf, too. The root is the whole image, which is never in a cut.
 
-A walk from the largest masks down the tree defines the distribution of the cuts. If a mask with score s contains
-masks with mean score m, the walk stops at this mask with probability s / (s + m). Otherwise the walk visits the inner
-masks and the remaining pixels. For the values w of `node_values`, the Gibbs distribution of cuts, proportional to
-exp(sum of w over the cut), is that of the walk. Every `CutSampler` at temperature 1 draws from this distribution.
+A walk from the largest masks down the tree defines the distribution of the cuts. At a mask of score s that contains
+masks of mean score m, it stops with probability s / (s + m); otherwise it goes on to the inner masks and the
+remaining pixels. For the values w of `node_values`, the Gibbs distribution of cuts, proportional to exp(sum of w over
+the cut), is that of the walk. Every `CutSampler` at temperature 1 draws from this distribution.
 """
 
 from __future__ import annotations

@@ -123,8 +123,8 @@ def filled_disparity(frame: Frame) -> np.ndarray:
 def curvature(disparity: np.ndarray, resize: float) -> tuple[np.ndarray, np.ndarray]:
     """Two maps (H, W) of the strength of the concave and of the convex curvature of a disparity image (H, W).
 
-    A curvature x has the strength x / (x + 2). Concave curvature is the largest eigenvalue of the Hessian. Convex
-    curvature is minus the smallest eigenvalue. `resize` is the image width / 640.
+    A curvature x has the strength x / (x + 2). The concave one is the largest eigenvalue of the Hessian, the convex
+    one minus the smallest. `resize` is the image width / 640.
     """
     s = _blur(resize)
     smooth = cv2.GaussianBlur(disparity, (0, 0), s)

@@ -399,7 +399,7 @@ class BorderTree(MergedTree):
 
 
 def tree_of_merges(image: np.ndarray, n_regions: int, merges: list[tuple[int, int, float]]) -> Tree:
-    """The tree of a list of merges. Merge k creates node n_regions + k. A root joins the remaining regions.
+    """The tree of a list of merges. Merge k makes node n_regions + k, and a root joins what remains.
 
     `image` (H, W) int has the region of every pixel; region 0 is the table. A merge is (node, node, log odds).
     """

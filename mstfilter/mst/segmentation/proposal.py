@@ -215,10 +215,10 @@ def complete_segments(
 ) -> tuple[tuple[Hypothesis, ...], dict[str, Any]]:
     """Hypotheses from sampled segmentations of the last frame of a clip, and counts of objects and segments.
 
-    Each sample is an int64 array of segments. ``mask_of(segment)`` returns the mask (H, W) bool. Each distinct
-    segment is completed to a 3-D shape once, with the random stream ``"completion", segment``. The shape does not
-    depend on the other segments. If the completer is stochastic, each further sample k of a segment gets a new shape,
-    with the random stream ``"completion", segment, k``.
+    Each sample is an int64 array of segments, of which ``mask_of(segment)`` returns the masks (H, W) bool. Each
+    distinct segment is completed to a 3-D shape once, with the random stream ``"completion", segment``, whatever the
+    other segments are. If the completer is stochastic, each further sample k of a segment gets a new shape, with the
+    random stream ``"completion", segment, k``.
     """
     completer = completer.at(clip)
     times: Counter[int] = Counter()
@@ -249,9 +249,9 @@ def hypothesis_of(
 ) -> Hypothesis:
     """One hypothesis from the 3-D shapes of the segments of a frame, at the pause `birth`.
 
-    Segments get the labels 1, 2, ... in order. A segment without voxels gets no `ObjectRecord`. Voxels with
-    probability `threshold` or more are occupied. `mstfilter.mst.completion.arbitrate` assigns voxels that several
-    shapes contain.
+    Segments get the labels 1, 2, ... in order, but one without voxels gets no `ObjectRecord`. Voxels with probability
+    `threshold` or more are occupied, and those in several shapes are assigned by
+    `mstfilter.mst.completion.arbitrate`.
     """
     labels = arbitrate(completions, grid, threshold)
     present = np.bincount(labels.ravel(), minlength=len(completions) + 1)

@@ -83,8 +83,8 @@ class Warp(Bounded):
     ) -> WarpResult:
         """Move objects. If all motions are the identity, the result contains the same hypothesis object.
 
-        `motions` maps labels to motions in world metres. Objects without an entry do not move. `residuals` maps
-        labels to residuals (see `collisions`).
+        `motions` maps labels to motions in world metres, and objects without one do not move. `residuals` maps labels
+        to residuals (see `collisions`).
         """
         if unknown := motions.keys() - {record.label for record in hypothesis.objects}:
             raise InputError(f"motions have the labels {sorted(unknown)}, which the hypothesis does not contain")
