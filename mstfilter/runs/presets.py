@@ -7,8 +7,8 @@
 ``mst`` is the default, ``paper`` the published algorithm, and ``authors`` the program of its authors. A preset is a
 TOML file with the fields of `ParticleFilter`, one table for each component, and it can extend another one, so that it
 lists only the differences. The files are in ``models/`` beside the package (installed as ``mstfilter/_models``);
-``base.toml`` there has what `mst` and its baselines share; without an update, it is no
-preset by itself. In a file that extends another,
+``base.toml`` there has what `mst` and its baselines share; as it has no update, it is no preset by itself. In a file
+that extends another,
 
 =======================================  =============================================================================
 ``base = "base"``                        fields that are not named in the file are those of the base
@@ -56,7 +56,7 @@ def preset(name: str = "mst", *overrides: str, allow_files: bool = True) -> Part
         The preset, such as "mst", or the path of a TOML file.
     *overrides : str
         Changes ``path=value``, such as "n=10", "resampler=systematic" or "transition.rule=paper". Naming a component
-        resets its fields. A component of your own is ``./mine.py:Mine``, the file of which is executed.
+        resets its fields; one of your own is ``./mine.py:Mine``, and the file is executed.
     allow_files : bool
         Whether components may be named by files.
 

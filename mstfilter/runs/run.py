@@ -2,8 +2,8 @@
 
 >>> run = filter_recording(recording, load_config("mst"), Path("runs/mine"), seed=0)
 
-All input is checked before the folder is made. An interrupted run is resumed by the same call with the same
-configuration, seed and recording. A resumed run and an uninterrupted run have the same result.
+All input is checked before the folder is made. If the run is interrupted, the same call with the same configuration,
+seed and recording resumes it, and the result is that of an uninterrupted run.
 """
 
 from __future__ import annotations
@@ -73,18 +73,18 @@ def filter_recording(
     config : mapping
         A configuration from `mstfilter.runs.presets.load_config`.
     path : Path
-        The run folder. The folder must be new, be empty, or contain the same interrupted run.
+        The run folder: new, empty, or with the same run, interrupted.
     seed : int
         Seed of all random streams.
     replace : bool
-        Whether to remove an earlier run in the folder after the first step has succeeded.
+        Whether an earlier run in the folder is replaced. It is removed only when the first step has succeeded.
     allow_files : bool
         Whether components may come from ``./file.py:Class``.
     progress : bool or callable
-        True shows a progress bar. A function is called before the first step and after every step, with the number
-        of finished pauses and the number of all pauses.
+        True shows a progress bar. A function is called before the first step and after every step, with the numbers
+        of finished and of all pauses.
     n_threads : int
-        Number of threads of one step. The result does not depend on the number of threads.
+        Number of threads of one step; the result does not depend on it.
 
     Raises
     ------

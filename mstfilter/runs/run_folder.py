@@ -5,10 +5,10 @@
 
 The page "Runs and reports" of the documentation lists the files.
 
-The folder of a pause has a temporary name until it is complete, so a stopped run has only complete pauses.
-`filter_recording` resumes from state.npz of the last complete pause. `mstfilter.scene.encode_hypotheses` makes the
-arrays ``particles/...`` in state.npz. The same seed gives the same bytes in all files except
-seconds.json and run.json.
+A pause is written under a temporary name until it is complete, so a run that was stopped has complete pauses only,
+and `filter_recording` resumes it from state.npz of the last one. (The arrays ``particles/...`` in there are made by
+`mstfilter.scene.encode_hypotheses`.) The same seed gives the same bytes in all files except seconds.json and
+run.json.
 """
 
 from __future__ import annotations
@@ -146,7 +146,9 @@ class HypothesisCodec(Codec):
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A run on disk.
+    """A run on disk: what a filter made of a recording, pause by pause.
+
+    Pauses are counted from 0. If a file is damaged, or missing although each run has it, InputError is raised.
 
     Parameters
     ----------

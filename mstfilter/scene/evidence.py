@@ -78,13 +78,13 @@ class NoFreeSpace(Projection):
 class FreeSpace(Projection):
     """Clears voxels that the depth image observes as free.
 
-    A voxel is free if its centre lies in front of the measured surface by more than the sum of two margins. The
-    margins account for the size of the voxel and the sensor noise (`mstfilter.scene.depth_sigma`). Voxels that are
-    not observed (no depth reading, robot pixel, outside the image, behind a surface) are kept. A voxel that contains
-    a measured point is kept.
+    A voxel is free if its centre lies in front of the measured surface by more than the sum of two margins, one for
+    the size of the voxel and one for the noise of the sensor (`mstfilter.scene.depth_sigma`). Voxels that are not
+    observed (no depth reading, robot pixel, outside the image, behind a surface) are kept, and so is a voxel that
+    contains a measured point.
 
-    With several cameras (`Frame.views`), a voxel is free if at least one camera observes the voxel as free and no
-    camera measures a point in the voxel.
+    With several cameras (`Frame.views`), a voxel is free if at least one observes it as free and none measures a
+    point in it.
 
     Parameters
     ----------
@@ -147,11 +147,11 @@ _LEAST_PIXELS = 30  # in an image of 640 x 480 pixels: an object with fewer of t
 def surface_agreement(hypothesis: Hypothesis, frame: Frame) -> tuple[np.ndarray, float]:
     """Fraction of the visible surface that a frame confirms, for each object and for the whole hypothesis.
 
-    The test renders the hypothesis and uses the pixels inside the rendered outlines. Pixels without a depth reading
-    are not used. A pixel with a reading in front of the surface is not used, because another object may hide the
-    surface. At each remaining pixel, the surface is confirmed if the pixel can belong to an object (`foreground`)
-    and the reading is not far behind the surface. The tolerance, in front and behind, is the edge of a voxel plus
-    three standard deviations of the depth noise.
+    The hypothesis is rendered, and the pixels inside the rendered outlines are used, except those without a depth
+    reading, and those with a reading in front of the surface, which another object may hide. At each remaining pixel,
+    the surface is confirmed if the pixel can belong to an object (`foreground`) and the reading is not far behind the
+    surface. The tolerance, in front and behind, is the edge of a voxel plus three standard deviations of the depth
+    noise.
 
     Returns
     -------
@@ -195,7 +195,7 @@ def _interior(rendered: Rendering, size: float) -> np.ndarray:
 class Evidence(Checked, ABC):
     """A term in the score of candidate hypotheses.
 
-    The documentation of each term lists the data that the term uses, so that users see whether terms share data.
+    The docstring of each term lists the data that it uses, so that you see whether terms share data.
     """
 
     @returns(lambda self, found, hypotheses, clip: check_array(found, (len(hypotheses),)).astype(np.float64))

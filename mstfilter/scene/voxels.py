@@ -386,8 +386,8 @@ class Hypothesis:
     def with_labels(self, labels: np.ndarray) -> Hypothesis:
         """A hypothesis with the same objects and a new label grid.
 
-        The fields `source` and `motion` of objects with changed voxels are reset. Objects without voxels are removed.
-        Raises InputError if a label has no `ObjectRecord`.
+        Objects whose voxels change lose their `source` and `motion`, and those without voxels are removed. Raises
+        InputError if a label has no `ObjectRecord`.
         """
         labels = labels_on(self.grid, labels)
         different = labels != self.labels
@@ -412,11 +412,11 @@ class Hypothesis:
 
     @property
     def shares(self) -> Occupancy:
-        """The field `occupancy`. If it is None, every occupied voxel gets probability 1."""
+        """The field `occupancy`, or if it is None, probability 1 at every occupied voxel."""
         return self.occupancy or Occupancy(self.labels, (self.labels > 0).astype(np.float16))
 
     def crop(self, label: int) -> Crop:
-        """The voxels of an object, with probabilities if the hypothesis has probabilities."""
+        """The voxels of an object, with probabilities if the hypothesis has some."""
         if self.occupancy is None:
             return Crop.of(self.labels == label)
         labelled = np.flatnonzero(self.labels == label)
@@ -473,8 +473,8 @@ class Hypothesis:
     def pose(self, label: int) -> RigidTransform:
         """Rigid motion of an object in world metres since the object was first proposed.
 
-        The motion consists of the tracked motions. It does not include a motion that the camera did not record,
-        after which the object was recognised at another place.
+        It consists of the tracked motions, so it lacks any that the camera did not record and after which the object
+        was recognised at another place.
         """
         return self.record(label).pose
 

@@ -70,7 +70,7 @@ _LEAST_PART = 200  # pixels of a part beside an open border, in an image of 640 
 
 
 class Border(NamedTuple):
-    """A border in an image. The hypotheses disagree about whether both sides of the border are one object."""
+    """A border in an image: the hypotheses disagree whether both sides of it are one object."""
 
     one_object: float  #: probability that both sides are one object, if both are objects
     pixels: np.ndarray  #: (m, 2) pixels (column, row) on the border
@@ -199,10 +199,10 @@ class Belief:
         """Probability (...) that two voxels belong to the same object.
 
         ``sum_i w_i [k_i(a) = k_i(b) > 0] min(o_i(a), o_i(b))``, where hypothesis i has the most probable object
-        k_i(v) at voxel v, with probability o_i(v) (`Hypothesis.shares`). If an object is a level set of its
-        probabilities, the minimum is the probability that the object contains both voxels. `a` and `b` (..., 3)
-        are broadcast against each other. If a = b, the result is the occupancy. If b has all voxels, the result is
-        the extent of the object at a.
+        k_i(v) at voxel v, with probability o_i(v) (`Hypothesis.shares`). An object is taken to be a level set of its
+        probabilities, so the minimum is the probability that it contains both voxels. `a` and `b` (..., 3) are
+        broadcast against each other: a = b gives the occupancy, and all voxels as b give the extent of the object at
+        a.
         """
         at_a, at_b = np.broadcast_arrays(_flat_voxels(self.grid, a), _flat_voxels(self.grid, b))
         found = np.zeros(at_a.shape)
@@ -234,9 +234,9 @@ class Belief:
     def boundary_entropy(self) -> np.ndarray:
         """Entropy (X, Y, Z) of the segmentation at a voxel, the largest over its six faces; at most log 2.
 
-        The entropy of a face is ``H(S | B) = P(B) h(P(S | B))`` with ``h(p) = -p log p - (1 - p) log(1 - p)``. B
-        means that both voxels at the face are occupied, and S that one object occupies both voxels. The entropy of
-        occupancy, H(B), is not included: H(B, S) = H(B) + H(S | B).
+        The entropy of a face is ``H(S | B) = P(B) h(P(S | B))`` with ``h(p) = -p log p - (1 - p) log(1 - p)``, where
+        B means that both voxels at the face are occupied, and S that one object occupies both. Whether they are
+        occupied is another question, whose entropy H(B) is not included: H(B, S) = H(B) + H(S | B).
         """
         largest = np.zeros(self.grid.shape)
         for axis in range(3):
@@ -260,8 +260,8 @@ class Belief:
         """Map (H, W) of the expected Jaccard distance between the objects that two hypotheses show at a pixel.
 
         Both hypotheses are drawn by weight: ``1 - sum_ij w_i w_j J(A_i, A_j)``, where A_i is the set of pixels of the
-        object that hypothesis i shows at the pixel, and J is the Jaccard index. J is 1 if neither hypothesis shows an
-        object at the pixel, and 0 if only one hypothesis shows an object.
+        object that hypothesis i shows at the pixel, and J the Jaccard index: 1 if neither shows an object there, and
+        0 if only one does.
         """
         refined, mass = self.refined_image(camera)
         shared = refined.overlaps()
@@ -306,10 +306,9 @@ class Belief:
     def partition_entropy(self, tolerance: float = 0.0) -> float:
         """Entropy of the segmentation of the scene, in nats.
 
-        ``-sum_s P(s) log P(s)``, where P(s) is the weight of the hypotheses with segmentation s. The entropy is the
-        expected information of the true segmentation. Without tolerance, the entropy is an upper bound of the
-        information of every outcome that the labels determine. The distance for the tolerance is
-        `information.partition_distance`.
+        ``-sum_s P(s) log P(s)``, where P(s) is the weight of the hypotheses with segmentation s. This is the expected
+        information of being told the true segmentation, so without tolerance no outcome that the labels determine
+        tells more. The distance for the tolerance is `information.partition_distance`.
         """
         rows = canonical_rows(self._refined.objects)
         return outcome_information(self._mass, rows, partition_distance, self._refined.sizes, tolerance)
@@ -331,8 +330,8 @@ class Belief:
     def push_information(self, region: Any, tolerance: float = 0.0) -> float:
         """Information of a push at a voxel or a region, if the moved voxels are observed.
 
-        The outcome ``{v | L_i(v) = L_i(u) > 0 for a u in region}`` has all voxels of all objects with a voxel in the
-        region. Other objects that the pushed objects would move are ignored.
+        The outcome ``{v | L_i(v) = L_i(u) > 0 for a u in region}`` has all voxels of the objects with a voxel in the
+        region. Other objects that these would push along are ignored.
         """
         cells = np.unique(self._refined.cells.ravel()[_flat_region(self.grid, region)])
         moved = self._refined.objects_in(cells)[self._refined.objects]
@@ -355,9 +354,9 @@ class Belief:
     def most_informative(
         self, actions: Sequence[Action], information: Callable[[Action], float], at_least: float = 1e-9
     ) -> Action | None:
-        """The action of largest expected information, or the first of several such actions.
+        """The action of largest expected information; of several, the first.
 
-        The result is None if no action has `at_least` nats, for example if the hypotheses agree on all outcomes.
+        None if no action has `at_least` nats, for example because the hypotheses agree on all outcomes.
         """
         values = [information(action) for action in actions]
         if np.isnan(values).any():
@@ -370,8 +369,8 @@ class Belief:
     def information(self, outcome: Callable[[Hypothesis], Hashable]) -> float:
         """Information of an action whose outcome is determined by the hypothesis.
 
-        The information is ``H(O)`` with ``P(O = o) = sum_i w_i [outcome(h_i) = o]``. The outcome must not contain
-        labels, because labels are arbitrary in each hypothesis.
+        It is ``H(O)`` with ``P(O = o) = sum_i w_i [outcome(h_i) = o]``. The outcome must not contain labels, because
+        each hypothesis numbers its objects as it likes.
         """
         outcomes = [(outcome(h), w) for w, h in zip(self.weights, self.hypotheses, strict=True) if w > 0]
         try:
@@ -385,8 +384,8 @@ class Belief:
     def estimate(self) -> Hypothesis:
         """The hypothesis of least expected loss: ``argmin_i sum_j w_j loss(h_i, h_j)``.
 
-        The loss is 1 - quality (weighted coverage in the form ``objects``). The result is the best single answer
-        among the hypotheses if the true scene is distributed as the belief.
+        The loss is 1 - quality (weighted coverage in the form ``objects``). If the true scene is distributed as the
+        belief says, no hypothesis is a better single answer.
         """
         hypotheses, mass = self._merged
         return hypotheses[least_loss([h.labels for h in hypotheses], mass)]

@@ -98,7 +98,7 @@ def _check_completions(
 
 @dataclass(frozen=True)
 class Completer(SurfaceRule, ABC):
-    """Estimates the hidden part of objects. Parameters: `SurfaceRule`, which says what a frame shows of an object."""
+    """Estimates the hidden part of objects. The parameters are those of `SurfaceRule`: what a frame shows of them."""
 
     #: Whether `fill` draws random numbers. The result is then not reused for the next hypothesis.
     stochastic: ClassVar[bool] = False
@@ -141,20 +141,20 @@ class Completer(SurfaceRule, ABC):
     def complete(
         self, rng: np.random.Generator, frame: Frame, masks: Sequence[np.ndarray], grid: VoxelGrid
     ) -> list[Completion]:
-        """Complete several masks of a frame. The pose of a frame places the frame in the grid.
+        """Complete several masks of a frame, whose pose says where in the grid it looks.
 
         Parameters
         ----------
         rng : Generator
-            Only stochastic completers draw random numbers. Each mask has a separate random stream.
+            Only stochastic completers draw from it; each mask has a random stream of its own.
         masks : sequence of (H, W) bool
             Each mask is one segment. Pixels without a reading, on the robot, or outside the grid are ignored.
 
         Returns
         -------
         list of Completion
-            One completion for each mask. Voxels observed as free have probability 0. The completion of a mask with a
-            reading in the grid has at least one voxel of probability 0.5 or more, so no visible object is lost.
+            One for each mask. Voxels observed as free have probability 0. If the mask has a reading in the grid, at
+            least one voxel has a probability of 0.5 or more, so no visible object is lost.
         """
         streams = [child(rng, "mask", k) if self.stochastic else rng for k in range(len(masks))]
         return self.complete_each(streams, frame, masks, grid)
@@ -170,9 +170,9 @@ class Completer(SurfaceRule, ABC):
     ) -> list[Completion]:
         """Complete masks with a given random stream for each mask, and with earlier views of each object.
 
-        The completion of a mask does not depend on the other masks. With views, a mask (H, W) may be empty. The views
-        of an object are moved to its current pose. `Completion.views` has the views that were used. A completer that
-        does not use views returns completions without views.
+        The completion of a mask does not depend on the other masks. The views of an object are moved to its current
+        pose; with them, a mask (H, W) may be empty. `Completion.views` has those that were used, and is empty if the
+        completer uses none.
         """
         masks = [np.asarray(mask, dtype=bool) for mask in masks]
         for mask in masks:
@@ -249,7 +249,7 @@ def finish(offset: np.ndarray, seen: ObservedBox, filled: np.ndarray, key: str) 
 
 
 class ClipCompleter(Completer):
-    """A completer that depends on the clip, for example because it reads a folder for each pause."""
+    """A completer that depends on the clip, for example because it reads files for each pause."""
 
     @returns(lambda self, found, clip: check_type(found, Completer, "a Completer"))
     @abstractmethod

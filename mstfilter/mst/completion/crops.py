@@ -41,10 +41,10 @@ CHANNELS = (
 
 @dataclass(frozen=True)
 class Architecture(ABC):
-    """Builds a completion network for weights that the user trained.
+    """Builds a completion network for weights of your own.
 
-    The weights are in the folder of a model (`mstfilter.base.trained`). In ``model.toml`` of this folder, the entry
-    `architecture` is the name of the class.
+    The weights are in the folder of a model (`mstfilter.base.trained`), whose ``model.toml`` names the class in the
+    entry `architecture`.
     """
 
     @abstractmethod
@@ -59,9 +59,8 @@ class Architecture(ABC):
 def crop_box(voxels: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
     """First voxel (3,) of the crop of an object with readings in `voxels` (k, 3), and the voxel after the crop.
 
-    The crop is centred on the range of the readings (percentiles 2 to 98), and the bottom of the crop is on the
-    table. The crop ends at the border of the grid. If the object is larger than all crops of the network, the crop
-    contains the whole object.
+    The crop is centred on the range of the readings (percentiles 2 to 98), stands on the table, and ends at the
+    border of the grid. If the object is larger than all crops of the network, the crop contains all of it.
     """
     low, high = np.percentile(voxels, (2, 98), axis=0)
     table = max(0, int(np.floor(-grid.origin[2] / grid.voxel_size + 1e-6)))

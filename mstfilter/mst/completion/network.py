@@ -43,14 +43,15 @@ class NetworkCompleter(Completer, UsesFiles):
     weights : str
         Name of a trained model of the package, the folder of a model (`mstfilter.base.trained`), or an ONNX file.
     least_surface : float
-        If the network keeps less than the share `least_surface` of a large visible surface, the whole surface gets at
-        least probability .5. Walls and plates that are thinner than a voxel contain the centres of few voxels, so the
-        network removes much of their surface. With 0, the network's probabilities are used.
+        Walls and plates that are thinner than a voxel contain the centres of few voxels, so the network removes much
+        of their surface. If less than the share `least_surface` of a large visible surface survives, all of it is
+        restored (p >= .5). With 0, none is.
     log_odds : float
-        Added to the log odds of every voxel with a probability between 0 and 1. The network is calibrated for the
-        masks of its training scenes. The default was fitted to runs of `mst` (`experiments/partition_fit`).
+        Added to the log odds of every voxel with a probability between 0 and 1, because the network is calibrated for
+        the masks of its training scenes and not for those of a filter. The default was fitted to runs of `mst`
+        (`experiments/partition_fit`).
     architecture : Architecture, optional
-        The architecture of the model in the folder. The default is the architecture of this package's network.
+        That of the model in the folder. The default is that of the package's network.
     """
 
     weights: str = "completion"

@@ -51,8 +51,8 @@ class SurfaceRule(Checked):
     in_front, depth : float
         A voxel is visible surface if its centre is at most `in_front` voxels in front of the measured surface, and
         less than `depth` voxels behind it, along the optical axis. If all voxels with readings were surface, objects
-        would be half a voxel larger on all sides. On rendered boxes, the volume would be 1.41 instead of 1.13 times
-        the true volume, and the quality .71 instead of .82. The defaults were chosen on rendered boxes.
+        would be half a voxel larger on all sides: on rendered boxes, on which the defaults were chosen, the volume
+        would be 1.41 instead of 1.13 times the true one, and the quality .71 instead of .82.
     free_margin, free_sigmas : float
         A voxel is free if its centre is at least `free_margin` voxels, and at least `free_sigmas` standard deviations
         of the depth reading, in front of the measured surface.

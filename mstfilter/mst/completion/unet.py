@@ -153,7 +153,7 @@ class TrainedNetwork:
 def load_network(name: str, architecture: Architecture | None = None) -> TrainedNetwork:
     """Load a network by the name or folder of its model (`mstfilter.base.trained.open_model`), or from an ONNX file.
 
-    A user's network is tested on each crop size. Raises InputError if the network fails or returns invalid output.
+    A network of yours is tried on each crop size. Raises InputError if it fails or returns invalid output.
     """
     if architecture is None and not name.endswith(".onnx"):
         model = open_model(name, ARCHITECTURE)

@@ -69,8 +69,8 @@ class ConflictGraph:
     def networkx(self) -> nx.Graph:
         """The conflict graph as a `networkx.Graph`.
 
-        Vertices have the attributes ``side``, ``label`` and ``size``. Edges have the attribute ``intersection``, in
-        voxels. Neighbours are in ascending order.
+        Vertices have the attributes ``side``, ``label`` and ``size``, edges the attribute ``intersection``, in
+        voxels; neighbours are in ascending order.
         """
         graph = nx.Graph()
         objects = zip(self.side.tolist(), self.label.tolist(), self.size.tolist(), strict=True)

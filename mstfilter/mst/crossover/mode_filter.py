@@ -21,21 +21,21 @@ from mstfilter.scene import as_labels, occupied_box
 class ModeFilter(Bounded):
     """Majority filter over label grids.
 
-    An occupied voxel takes the most frequent other label in its window, if the count of this label exceeds the count
-    of the voxel's label by at least `margin`. If several labels are equally frequent, the largest label is used. Free
-    voxels are not counted as a label. An occupied voxel with more than `isolation` free voxels in its window becomes
-    free. All voxels of a sweep change at the same time. Sweeps are repeated until no voxel changes. Objects thinner
-    than half a window, for example a 2 cm book or a rod, are removed.
+    An occupied voxel takes the most frequent other label in its window (of equally frequent ones, the largest), if
+    there are at least `margin` more of it than of its own. Free voxels do not count as a label, but an occupied voxel
+    with more than `isolation` of them in its window becomes free. All voxels of a sweep change at the same time, and
+    sweeps are repeated until none does. So objects thinner than half a window, for example a 2 cm book or a rod, are
+    removed.
 
     Parameters
     ----------
     window : int
         Edge of the cubic window in voxels, an odd number. A window of 1 has no effect.
     margin : float
-        Least difference between the count of the other label and the count of the voxel's label.
+        By how many voxels the other label must at least outnumber the voxel's own.
     isolation : int
-        Largest number of free voxels in the window of an occupied voxel. With more free voxels, the occupied voxel
-        becomes free. An isolation of at least ``window**3`` has no effect.
+        Largest number of free voxels in the window of an occupied voxel. With more, it becomes free, so a number of
+        at least ``window**3`` has no effect.
     max_sweeps : int
         Largest number of sweeps.
     """

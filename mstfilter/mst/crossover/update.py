@@ -126,9 +126,9 @@ class CrossoverUpdate(Update):
     Parameters
     ----------
     free_space : Projection
-        Projects predicted hypotheses onto hypotheses that agree with the latest frame.
+        Projects predictions onto hypotheses that agree with the latest frame.
     crossover : Crossover
-        Makes one hypothesis from two hypotheses.
+        Makes one hypothesis of two.
     eta : int
         Number of candidates of each pair of a sample and a prediction.
     quality_exponent : float
@@ -147,7 +147,7 @@ class CrossoverUpdate(Update):
     ) -> Population:
         """The candidates of all pairs of a sample and a prediction. Each candidate is built at its first access.
 
-        Without a prediction, the proposed samples are returned. Without a proposal, refined predictions are returned.
+        Without a prediction, they are the samples, and without a proposal, the projected predictions.
         """
         if predicted is None:
             return union(None, proposed)
@@ -180,9 +180,9 @@ class CrossoverUpdate(Update):
 def _pairs(rng: np.random.Generator, n_proposed: int, n_predicted: int, eta: int) -> tuple[np.ndarray, np.ndarray]:
     """Sample i and prediction j of each candidate. Each pair occurs `eta` times in a row.
 
-    Each sample is paired with the predictions in cyclic order. The first predictions of the samples are drawn without
-    replacement. Systematic resampling takes equal steps through nearly equal weights. If all samples had the same
-    first prediction, systematic resampling would often select the same prediction.
+    Each sample is paired with the predictions in cyclic order, and their first predictions are drawn without
+    replacement. Systematic resampling takes equal steps through nearly equal weights: if all samples began with the
+    same prediction, it would often select that one.
     """
     rounds = -(-n_proposed // n_predicted)
     first = np.concatenate([rng.permutation(n_predicted) for _ in range(rounds)])[:n_proposed]

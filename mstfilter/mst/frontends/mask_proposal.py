@@ -37,8 +37,8 @@ class MaskProposal(Proposal, UsesFiles):
         Sampler of cuts of the tree of nested masks. At temperature 1, the cuts have the distribution that
         `mstfilter.mst.frontends.mask_trees` defines.
     objects : ObjectRule
-        Rule that decides which masks are objects. Other masks, such as that of the table, are background. A
-        background mask that contains other masks is always split into its parts.
+        Decides which masks are objects. The others, such as that of the table, are background; one that contains
+        further masks is always split into its parts.
     completer : Completer
     threshold : float
         Smallest probability of an occupied voxel.

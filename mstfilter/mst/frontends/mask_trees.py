@@ -6,13 +6,13 @@
 >>> w = node_values(tree, stop)
 >>> ExactCuts(temperature=1).sample(rng, tree, w, 10)                        # the object in 60 % of the cuts
 
-Two masks of a set are disjoint, or one mask contains the other. Leaf 0 of the tree has the pixels without a mask. If
-a mask contains masks, its remaining pixels are also a leaf. The root is the whole image and is never in a cut.
+Two masks of a set are disjoint, or one contains the other. Leaf 0 of the tree has the pixels without a mask, and if a
+mask contains masks, its remaining pixels are a leaf, too. The root is the whole image, which is never in a cut.
 
-A walk from the largest masks down the tree defines the distribution of the cuts. If a mask with score s contains
-masks with mean score m, the walk stops at this mask with probability s / (s + m). Otherwise the walk visits the inner
-masks and the remaining pixels. For the values w of `node_values`, the Gibbs distribution of cuts, proportional to
-exp(sum of w over the cut), is that of the walk. Every `CutSampler` at temperature 1 draws from this distribution.
+A walk from the largest masks down the tree defines the distribution of the cuts. At a mask of score s that contains
+masks of mean score m, it stops with probability s / (s + m); otherwise it goes on to the inner masks and the
+remaining pixels. For the values w of `node_values`, the Gibbs distribution of cuts, proportional to exp(sum of w over
+the cut), is that of the walk. Every `CutSampler` at temperature 1 draws from this distribution.
 """
 
 from __future__ import annotations
@@ -131,11 +131,11 @@ def nested_masks(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Make masks with arbitrary overlaps disjoint or nested, and return masks and scores.
 
-    Use this function for automatic mask generators. Masks are processed in order of decreasing score, and each mask
-    is compared with all kept masks. Two masks are neighbours if they share at most ``1 - share`` of the smaller mask.
-    Two masks are nested if they share at least `share` of the smaller mask, and the smaller area is less than `share`
-    of the larger area. Otherwise the mask with the lower score is removed. In nested pairs, the smaller mask loses
-    the pixels outside the larger mask. Common pixels of neighbours belong to the mask with the higher score.
+    This is for automatic mask generators. Masks are taken in order of decreasing score, and each is compared with all
+    that are kept. Two masks are neighbours if they share at most ``1 - share`` of the smaller one; their common
+    pixels then belong to the one with the higher score. They are nested if they share at least `share` of the smaller
+    one and its area is less than `share` of the larger; it then loses the pixels outside the larger. Otherwise the
+    mask with the lower score is removed.
     """
     check_number("share", share, above=0.5, at_most=1)
     masks = np.asarray(masks, dtype=bool)

@@ -141,8 +141,8 @@ class BorderNet(nn.Module):
 class PairNetwork:
     """A small network whose output is added to the linear log odds that two regions are different objects.
 
-    The network is a multilayer perceptron with rectified linear units. The features are standardised, and limited to
-    4 standard deviations. So the correction stays bounded for features that the fit has not seen.
+    The network is a multilayer perceptron with rectified linear units. The features are standardised and limited to 4
+    standard deviations, so the correction stays bounded for features that the fit has not seen.
     """
 
     mean: np.ndarray  #: (f,) of the features in the fit

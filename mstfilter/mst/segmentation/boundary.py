@@ -59,11 +59,10 @@ class ColourDepthBoundary(BoundaryModel):
     Parameters
     ----------
     colour_weight : float
-        Weight of the colour edges. The weight 0 disables colour.
+        Weight of the colour edges; 0 disables colour.
     quiet_table : float
-        Distance in pixels of a 640 px wide image. The boundary is 0 at pixels farther than `quiet_table` from all
-        surfaces above the table, so print and shadows on the table are ignored. With a negative distance, no pixel is
-        set to 0.
+        The boundary is 0 at pixels farther than this from all surfaces above the table, in pixels of a 640 px wide
+        image, so print and shadows on the table are ignored. A negative distance disables this.
     """
 
     colour_weight: float = 0.4
@@ -124,8 +123,8 @@ def filled_disparity(frame: Frame) -> np.ndarray:
 def curvature(disparity: np.ndarray, resize: float) -> tuple[np.ndarray, np.ndarray]:
     """Two maps (H, W) of the strength of the concave and of the convex curvature of a disparity image (H, W).
 
-    A curvature x has the strength x / (x + 2). Concave curvature is the largest eigenvalue of the Hessian. Convex
-    curvature is minus the smallest eigenvalue. `resize` is the image width / 640.
+    A curvature x has the strength x / (x + 2). The concave one is the largest eigenvalue of the Hessian, the convex
+    one minus the smallest. `resize` is the image width / 640.
     """
     s = _blur(resize)
     smooth = cv2.GaussianBlur(disparity, (0, 0), s)

@@ -58,9 +58,9 @@ class SceneCutObjectness(CutValue):
     Parameters
     ----------
     background_weight : float
-        Area of each pixel that is not above the table. With area 1, as in SceneCut, the table contributes most of the
-        optimal value v*. The width of the sampled distribution is relative to v*, so a larger table gives more random
-        cuts. With area 0, splits of the table do not change the value, and Markov chains waste steps on them.
+        Area of each pixel that is not above the table. With 1, as in SceneCut, the table contributes most of the
+        optimal value v*. Since the width of the sampled distribution is relative to v*, a larger table then gives
+        more random cuts. With 0, splits of the table do not change the value, and Markov chains waste steps on them.
     """
 
     background_weight: float = 0.003
@@ -86,8 +86,8 @@ class MergeLogOdds(CutValue):
 
     ``w(n) = -sum of logit P(boundary) over the merges inside n``. The probability that exactly the merges above the
     cut join different objects is proportional to exp(v(c)). The values are log probabilities, so the sampler needs a
-    `temperature` but no scale `sigma2`. If the tree has `odds` (`LearnedTree`), the logits are the `odds`. Without
-    `odds`, the probability of a border is `start`. Probabilities are clipped to 0.001 .. 0.999.
+    `temperature` but no scale `sigma2`. The logits are the `odds` of the tree if it has them (`LearnedTree`), else
+    those of its `start`. Probabilities are clipped to 0.001 .. 0.999.
     """
 
     def values(self, tree: Tree, frame: Frame) -> np.ndarray:
@@ -147,7 +147,7 @@ def check_values(tree: Tree, w: np.ndarray) -> np.ndarray:
 def optimal_cut(tree: Tree, w: np.ndarray) -> np.ndarray:
     """The cut of largest value, as nodes (n,) in ascending order, for node values `w` (N,).
 
-    If a node has the same value as the best cut of its subtree, the node is preferred to this cut.
+    If a node has the same value as the best cut of its subtree, the node is taken: fewer segments.
     """
     best = check_values(tree, w).tolist()
     keep = [True] * tree.n_nodes
@@ -168,7 +168,7 @@ def optimal_cut(tree: Tree, w: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class OptimalCut(CutSampler):
-    """Returns the optimal cut `n` times, without randomness. `OptimalCut` is the single-frame baseline (SceneCut)."""
+    """The optimal cut `n` times, without randomness: the single-frame baseline (SceneCut)."""
 
     def sample(self, rng: np.random.Generator, tree: Tree, w: np.ndarray, n: int) -> CutSample:
         cut = optimal_cut(tree, w)

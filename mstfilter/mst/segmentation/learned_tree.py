@@ -283,7 +283,7 @@ class Agglomeration:
 class MergedTree(TreeBuilder):
     """Best-first merging of watershed regions by learned log odds.
 
-    One leaf contains the table and all other background pixels. Only the root joins this leaf with other regions.
+    One leaf contains the table and all other background pixels; only the root joins it with other regions.
     """
 
     leaves: TreeBuilder = field(default_factory=UcmTree)
@@ -369,7 +369,7 @@ class BorderTree(MergedTree):
     """A `MergedTree` that uses features of the image and of the output of a border network.
 
     The network gives the log odds of a border between two regions, and the distance between the estimated centres of
-    their objects. The scenes for fitting the weights were not used to train the network.
+    their objects. The weights were fitted on scenes on which the network was not trained.
 
     Parameters
     ----------
@@ -399,7 +399,7 @@ class BorderTree(MergedTree):
 
 
 def tree_of_merges(image: np.ndarray, n_regions: int, merges: list[tuple[int, int, float]]) -> Tree:
-    """The tree of a list of merges. Merge k creates node n_regions + k. A root joins the remaining regions.
+    """The tree of a list of merges. Merge k makes node n_regions + k, and a root joins what remains.
 
     `image` (H, W) int has the region of every pixel; region 0 is the table. A merge is (node, node, log odds).
     """

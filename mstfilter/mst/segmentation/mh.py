@@ -155,10 +155,9 @@ class NodeMoves(MoveRule):
 class AuthorsMoves(MoveRule):
     """The moves of the authors' program, including an error: the target distribution is not stationary.
 
-    The choice is uniform over (node, direction). A move up is allowed for every node except the root. A move up
-    replaces the nodes of the cut that are descendants of the parent by the parent. The program takes 1 / (number of
-    choices) as the forward probability of a move up. But each sibling in the cut proposes the same move up, so merges
-    are accepted too often.
+    The choice is uniform over (node, direction). A move up, which every node except the root can make, replaces all
+    nodes of the cut below the parent by the parent. The program takes 1 / (number of choices) as its forward
+    probability. But each sibling in the cut proposes the same move, so merges are accepted too often.
     """
 
     def choose(self, random: Callable[[], float], state: CutState) -> tuple[int, bool] | None:
@@ -207,8 +206,8 @@ class AuthorsMoves(MoveRule):
 class SubtreeRedraw(MoveRule):
     """Redraws the cut of a random subtree from the Gibbs distribution `law`, which is the target of the chain.
 
-    The root of the subtree is uniform over the inner nodes. If an ancestor of this root is in the cut, the cut does
-    not change. A choice is (inner node, new nodes).
+    The root of the subtree is uniform over the inner nodes; if an ancestor of it is in the cut, the cut does not
+    change. A choice is (inner node, new nodes).
     """
 
     law: Gibbs

@@ -66,14 +66,14 @@ class Segments:
 class ObjectRule:
     """Decides which regions are objects.
 
-    A region is background if most of its depth readings are on the table, behind the table or outside the workspace.
-    A region is also background if fewer than `min_points` readings are above the table and in the workspace.
-    `min_points` is for an image of 640 x 480 pixels and is scaled by the area of the image.
+    A region is background if most of its depth readings are on the table, behind it or outside the workspace, or if
+    fewer than `min_points` of them are above the table and in the workspace.
 
     Parameters
     ----------
     min_points : int
-        Smallest number of depth readings of an object.
+        Smallest number of depth readings of an object in an image of 640 x 480 pixels. It is scaled by the area of
+        the image.
     mend : bool
         Whether noise is removed and missing readings of objects are estimated (`mstfilter.scene.foreground`). If
         False, every reading above the table can belong to an object, as published.
@@ -140,12 +140,12 @@ class TreeCutProposal(Proposal):
     Parameters
     ----------
     sampler : CutSampler
-        Draws the cuts. The sampler needs a `temperature` for log odds, or `sigma2` for `SceneCutObjectness`.
+        Draws the cuts. It needs a `temperature` for log odds, or `sigma2` for `SceneCutObjectness`.
     objects : ObjectRule
         Decides which regions of a cut are objects.
     weight_rule : {"equal", "p"}
-        With "equal", all weights are equal, which is correct for cuts drawn from p. With "p", the log weight is ``log
-        p(c) - log p(c*)`` as in the paper and the authors' program. With "p", the probability of a cut counts twice.
+        With "equal", all weights are equal, which is correct for cuts drawn from p. With "p", as in the paper and the
+        authors' program, the log weight is ``log p(c) - log p(c*)``, so the probability of a cut counts twice.
     threshold : float
         Voxels with at least this probability are occupied.
     """
@@ -215,10 +215,10 @@ def complete_segments(
 ) -> tuple[tuple[Hypothesis, ...], dict[str, Any]]:
     """Hypotheses from sampled segmentations of the last frame of a clip, and counts of objects and segments.
 
-    Each sample is an int64 array of segments. ``mask_of(segment)`` returns the mask (H, W) bool. Each distinct
-    segment is completed to a 3-D shape once, with the random stream ``"completion", segment``. The shape does not
-    depend on the other segments. If the completer is stochastic, each further sample k of a segment gets a new shape,
-    with the random stream ``"completion", segment, k``.
+    Each sample is an int64 array of segments, of which ``mask_of(segment)`` returns the masks (H, W) bool. Each
+    distinct segment is completed to a 3-D shape once, with the random stream ``"completion", segment``, whatever the
+    other segments are. If the completer is stochastic, each further sample k of a segment gets a new shape, with the
+    random stream ``"completion", segment, k``.
     """
     completer = completer.at(clip)
     times: Counter[int] = Counter()
@@ -249,9 +249,9 @@ def hypothesis_of(
 ) -> Hypothesis:
     """One hypothesis from the 3-D shapes of the segments of a frame, at the pause `birth`.
 
-    Segments get the labels 1, 2, ... in order. A segment without voxels gets no `ObjectRecord`. Voxels with
-    probability `threshold` or more are occupied. `mstfilter.mst.completion.arbitrate` assigns voxels that several
-    shapes contain.
+    Segments get the labels 1, 2, ... in order, but one without voxels gets no `ObjectRecord`. Voxels with probability
+    `threshold` or more are occupied, and those in several shapes are assigned by
+    `mstfilter.mst.completion.arbitrate`.
     """
     labels = arbitrate(completions, grid, threshold)
     present = np.bincount(labels.ravel(), minlength=len(completions) + 1)

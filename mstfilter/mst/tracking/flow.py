@@ -79,9 +79,9 @@ class ClipTracks:
 class DenseFlow(Bounded):
     """Dense inverse search flow (Kroeger et al., ECCV 2016; OpenCV's DIS), forward and backward.
 
-    `preset` is the preset of OpenCV. With the region "changed", the flow between two frames is zero outside a box
-    around the pixels that changed. With "image", the flow is computed in the whole image. The flow depends on the
-    number of OpenCV's threads, so this number becomes 1 in the whole process.
+    `preset` is that of OpenCV. With the region "changed", the flow between two frames is computed in a box around the
+    pixels that changed, and is zero outside; with "image", it is computed in the whole image. It depends on the
+    number of OpenCV's threads, so this becomes 1 in the whole process.
     """
 
     preset: Literal["ultrafast", "fast", "medium"] = "medium"

@@ -51,9 +51,9 @@ class MotionResidual:
     """Robust residual of a motion.
 
     `track_weight` is added to S if all visible points are on pixels that the flow traces back to another object.
-    `target_weight` is added to S if the motion explains no point that the flow traces back to this object.
-    S is infinite if less than `min_visible` of the points would be visible, except for the identity. An object
-    at rest can become hidden, but the image does not support a motion to one of many hidden positions.
+    `target_weight` is added to S if the motion explains no point that the flow traces back to this object. S is
+    infinite if less than `min_visible` of the points would be visible. The identity is excepted: an object at rest
+    can become hidden, but no image supports a motion to one of many hidden positions.
     """
 
     track_weight: float = 1.0

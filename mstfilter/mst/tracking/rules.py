@@ -125,7 +125,7 @@ class MotionRule(Checked, ABC):
     @returns(_check_candidates)
     @abstractmethod
     def candidates(self, rng: np.random.Generator, track: Track) -> tuple[Candidate, ...]:
-        """Possible motions of a segment, at least one. The method is called once for all hypotheses."""
+        """Possible motions of a segment, at least one; called once for all hypotheses that have it."""
 
     @returns(_check_choice)
     @abstractmethod
@@ -165,7 +165,7 @@ class PaperRule(MotionRule):
         Largest root mean square distance in metres at which ICP is accepted. The published value of 1 mm is below the
         noise of a depth camera at 0.7 m, so ICP is almost never accepted.
     registration : Registration
-        Performs the ICP. The paper does not state the initial motion. Here the initial motion aligns the centroids.
+        Performs the ICP, from a motion that aligns the centroids. (The paper names no initial motion.)
     """
 
     min_inliers: int = 5
@@ -238,17 +238,17 @@ class MstRule(MotionRule):
         Take the candidate with the best score ("map"), or draw one with probability proportional to exp(-n_eff S /
         2) for each particle ("sample").
     n_eff : float
-        Effective number of independent observations per segment, for ``select="sample"``. Residuals of neighbouring
-        pixels are correlated, so this number is much smaller than the number of pixels. The default has the largest
+        Effective number of independent observations per segment, for ``select="sample"``. It is much smaller than the
+        number of pixels, because residuals of neighbouring pixels are correlated. The default has the largest
         likelihood on 124 objects of simulated tuning scenes.
     use_flow, use_icp, use_sift : bool
         Estimators to use.
     n_refine : int
-        Number of best candidates that are refined against the whole last frame. The refined motions are also used.
+        This number of the best candidates are refined against the whole last frame, and become further candidates.
     search_above : float
-        If every score is larger than this value, the object is searched for around its last position, upright and
-        toppled. If it has fewer than 12 points, it moves only to a place with a score up to this value. A negative
-        value disables the search.
+        If every score is larger than this, the object is searched for around its last position, upright and toppled.
+        One with fewer than 12 points moves only to a place with a score up to this value, because the best place for
+        so few is often wrong. A negative value disables the search.
     max_score : float
         A motion is refuted if its score reaches this value. The default is the score of a motion out of the image.
     registration : Registration

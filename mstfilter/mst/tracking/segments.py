@@ -183,7 +183,7 @@ class MaskTracker(Checked, ABC):
     def track(self, clip: Clip, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Masks (H, W) bool of the last frame, one for each of the masks (H, W) bool of the first frame.
 
-        An empty mask means that the object is lost. Masks may overlap. A result should not depend on other masks.
+        An empty mask means that the object is lost. Masks may overlap, but a result should not depend on the others.
         """
 
 

@@ -60,16 +60,16 @@ class Warp(Bounded):
     Parameters
     ----------
     method : "smooth" or "splat"
-        With "smooth", every voxel x takes the value of a smoothed signed distance of the object's source at T^-1 x.
-        The object keeps its number of voxels. The source is the occupancy of the object after its last change other
-        than a motion. T is the product of all motions since then, so the shape does not degrade with the number of
-        motions. On 481 true motions of simulated objects of 50-3000 voxels, the mean Jaccard index with the true
-        voxels is .877. The method "splat", as in the authors' program, moves voxel centres forward and rounds them.
-        With "splat", an object loses 3-14 % of its voxels per step.
+        With "smooth", every voxel x takes the value of a smoothed signed distance of the object's source at T^-1 x,
+        and the object keeps its number of voxels. The source is its occupancy after the last change other than a
+        motion, and T the product of all motions since then, so the shape does not degrade with their number. On 481
+        true motions of simulated objects of 50-3000 voxels, the mean Jaccard index with the true voxels is .877. With
+        "splat", as in the authors' program, voxel centres are moved forward and rounded, so an object loses 3-14 % of
+        its voxels per step.
     collisions : "deepest" or "label"
-        Rule for a voxel that several objects cover. With "deepest", the voxel goes to the object in which it is
-        deepest or, for equal depths, to the object with the smaller residual. With "label", the voxel goes to the
-        object with the higher label, as in the authors' program.
+        Which object gets a voxel that several cover: with "deepest", the one in which it is deepest or, for equal
+        depths, the one with the smaller residual; with "label", as in the authors' program, the one with the higher
+        label.
     """
 
     method: Literal["smooth", "splat"] = "smooth"
@@ -83,8 +83,8 @@ class Warp(Bounded):
     ) -> WarpResult:
         """Move objects. If all motions are the identity, the result contains the same hypothesis object.
 
-        `motions` maps labels to motions in world metres. Objects without an entry do not move. `residuals` maps
-        labels to residuals (see `collisions`).
+        `motions` maps labels to motions in world metres, and objects without one do not move. `residuals` maps labels
+        to residuals (see `collisions`).
         """
         if unknown := motions.keys() - {record.label for record in hypothesis.objects}:
             raise InputError(f"motions have the labels {sorted(unknown)}, which the hypothesis does not contain")
@@ -284,13 +284,13 @@ class TrackingTransition(Transition):
     warp : Warp
         Moves the voxels.
     similarity : float
-        Segments are tracked as one if they share at least this part of the pixels of the larger segment. The most
-        frequent segment is tracked. With 1, every distinct segment is tracked.
+        Segments that share at least this part of the pixels of the larger one are tracked as one, by the most
+        frequent of them. With 1, every distinct segment is tracked.
     tracker : MaskTracker, optional
-        Tracks the masks of moving objects to the last frame. By default, the flow is used instead.
+        Tracks the masks of moving objects to the last frame, which by default the flow does.
     min_support : int
-        Smallest number of pixels of an object that agree with the depth image, in an image of 640 x 480 pixels. It is
-        scaled by the area of the image. Objects with fewer are not tracked.
+        An object is not tracked if fewer of its pixels agree with the depth image. The number is for an image of 640
+        x 480 pixels, and is scaled by the area of the image.
     """
 
     rule: MotionRule = field(default_factory=MstRule)

@@ -55,7 +55,7 @@ def filter_folder(
     replace, allow_files, n_threads
         See `mstfilter.runs.filter_recording`.
     on_pause : callable
-        Function that is called with each `Pause` after the files of the pause are written.
+        Called with each `Pause` once its files are written.
     """
     if not isinstance(reader, Redwood):
         name = type(reader).__name__

@@ -69,7 +69,7 @@ class Pause:
 
     @property
     def hypotheses(self) -> tuple[Hypothesis, ...]:
-        """The particles."""
+        """The hypotheses at this pause."""
         assert self.state.population is not None
         return tuple(self.state.population.particles)
 
@@ -88,7 +88,7 @@ class _Item:
 
 
 class Stream:
-    """Filters frames while they arrive, and has hypotheses after every pause.
+    """Filters the frames of a camera while they arrive. After every pause, it has new hypotheses.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ class Stream:
     max_pixels : int
         Images with more pixels are reduced to this number. 0 means no limit.
     threads : int
-        Number of threads of one step. The results do not depend on this number.
+        Number of threads of one step; the results do not depend on it.
 
     Notes
     -----
@@ -199,9 +199,9 @@ class Stream:
         Returns
         -------
         bool
-            Whether the frame was accepted. A frame is dropped and counted if it has no depth, if its time stamp is
-            not later than the previous time stamp, or if the queue is full. After a time stamp far ahead, or after
-            the clock is set, one frame is dropped, and the times of the stream continue from the last one.
+            Whether the frame was accepted. It is dropped, and counted in `counts`, if it has no depth, if its time
+            stamp is not later than the one before, or if the queue is full. If a stamp is far ahead or the clock was
+            set, one frame is dropped, and the times of the stream continue from the last one.
 
         Raises
         ------
@@ -304,7 +304,7 @@ class Stream:
         return Belief.of_step(self.last.state, self.last.info)
 
     def wait(self) -> None:
-        """Wait until all pushed frames are processed. Raises InputError in `on_pause`."""
+        """Wait until all pushed frames are processed. Raises InputError in `on_pause`, which it would wait for."""
         self._check_caller("wait()")
         self._queue.join()
         if self._step is not None:

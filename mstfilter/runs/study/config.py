@@ -92,7 +92,7 @@ class SceneEntry(_Entry):
 
 
 class ArmEntry(_Entry):
-    """A filter to compare: a preset with changes. Each combination of comma-separated values is a filter."""
+    """An arm: a preset with changes. Each combination of comma-separated values is an arm of its own."""
 
     preset: Texts = ("mst",)  #: names, or paths of TOML files
     set: Texts = ()  #: changes ``path=value``, as for `mstfilter run`; ``path=a,b`` makes two arms

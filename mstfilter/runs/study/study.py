@@ -3,8 +3,8 @@
 >>> result = run_study(load_study("study.toml"), Path("studies/first"), workers=2)
 >>> result.done, result.failed
 
-The same call resumes an interrupted study and repeats failed runs. Finished runs with unchanged identity are not
-repeated. An interruption does not change the metrics.
+The same call resumes an interrupted study: it makes the missing and the failed runs, and leaves finished ones alone
+if their identity has not changed. An interruption does not change the metrics.
 
 The runs are a loop over recordings by `joblib.Parallel`. Here, each of its threads waits for one worker process
 (`mstfilter.runs.study.worker`). On a cluster, dask gives the recordings to its machines, whose threads do the same.
@@ -72,7 +72,7 @@ def run_study(
     Parameters
     ----------
     path : Path
-        The study folder. The folder must be new, empty, or from an earlier call.
+        The study folder: new, empty, or from an earlier call.
     overrides : sequence of str
         Overrides for every arm. Each combination of comma-separated values is an arm. ``metric=./file.py:Class`` adds
         an own metric.

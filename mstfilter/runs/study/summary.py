@@ -159,8 +159,8 @@ def summarise(
     reference : str
         The arm with which the other arms are compared.
     cost : sequence of str
-        Columns of time and memory. These columns are averaged over all pauses and have no comparisons of arms. A
-        missing stage counts as 0 seconds. Of several filter seeds, the first is omitted, because it fills the cache.
+        Columns of time and memory, which are averaged over all pauses and not compared between arms. A missing stage
+        counts as 0 seconds. Of several filter seeds, the first is omitted, because it fills the cache.
     reported_only : collection of str
         Arms that are not part of the comparisons with adjusted p values.
     own : sequence of str
