@@ -163,12 +163,8 @@ class BaseTree:
                 found.append(merge)
                 stack += merge[:2]
         found = sorted(found, key=lambda merge: -merge[2])[:_MOST_MERGES]
-        return [
-            TreePart(self.regions_of(child), odds)
-            for *children, odds in found
-            if odds >= _KNOWN
-            for child in children
-        ]
+        known = [merge for merge in found if merge[2] >= _KNOWN]
+        return [TreePart(self.regions_of(child), odds) for *children, odds in known for child in children]
 
 
 class _Examination:
