@@ -134,12 +134,15 @@ class Resampler(Component):
 
     A scheme that needs only the weights inherits `WeightResampler` and defines `select`.
 
-    Every scheme promises the following, and `mstfilter.smc.testing.ResamplerContract` tests it:
+    Every scheme promises the following. Its only check is `mstfilter.smc.testing.ResamplerContract`; a filter trusts
+    a scheme and does not count its particles.
 
     - The particles are those at the ancestors, with their other parents. A particle of weight 0 is never selected.
     - There are n of them, unless `exact_size` or `chooses_n` say otherwise.
     - If it is `properly_weighted`, the copies of particle i carry in expectation the weight W_i that it had; with
       equal output weights, these are n W_i copies.
+    - A common factor of all weights changes nothing but the log weights of the result.
+    - The population is left as it is, and all randomness comes from `rng`.
     """
 
     @property
@@ -176,7 +179,7 @@ class WeightResampler(Resampler):
         Returns
         -------
         ancestors : (n,) int
-            Indices into the m particles.
+            Indices into the m particles; fewer if `exact_size` is False.
         log_weights : (n,) float or None
             Log weights of the selected particles. If None, each of them gets the log of the mean input weight, so
             the estimate of the evidence does not change.

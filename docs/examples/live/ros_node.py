@@ -26,7 +26,7 @@ from mstfilter.formats import Settled
 from mstfilter.formats.ros_images import colour_image, depth_image
 from mstfilter.mst.belief import Belief
 from mstfilter.runs.live import Pause, Stream
-from mstfilter.scene import project
+from mstfilter.scene import outlined
 
 _WAITING = 30  # images of each topic that wait for a partner
 
@@ -95,7 +95,7 @@ class ImagePairs:
 def label_image(pause: Pause) -> np.ndarray:
     """Labels (H, W) uint16 of the objects of the estimate in the image of the pause."""
     assert pause.state.population is not None
-    return project(Belief(pause.state.population).estimate(), pause.clip.after.camera)
+    return outlined(Belief(pause.state.population).estimate(), pause.clip.after)
 
 
 def belief_json(pause: Pause) -> str:

@@ -8,8 +8,9 @@ say and gives partitions of the readings their probabilities. Shapes come last, 
 
 =============  =========================================================================================
 `update`       `PartitionUpdate`: the five steps, from free space to completed objects
-`cells`        the common refinement of all partitions, odds of pairs of cells, probabilities of partitions
-`candidates`   choices of a prediction, a partition and the hidden objects that stay, with their weights
+`cells`        the common refinement of all partitions; how image and past are weighed (`PairEvidence`), and the
+               probabilities of partitions that follow
+`candidates`   choices of a prediction, a partition and the hidden objects that stay; products of probabilities
 `motions`      which predicted objects have moved as one body
 `association`  which segment of the image continues which predicted object
 =============  =========================================================================================

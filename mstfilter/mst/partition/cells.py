@@ -1,4 +1,6 @@
-"""Readings and cells of a depth image, and probabilities of the partitions of the cells into objects.
+"""Readings and cells of a depth image, and how image and past are weighed: probabilities of partitions of the cells.
+
+To change how much the past counts against the image, change `PairEvidence`, or write another `PairOdds`.
 
 >>> readings = Readings.of(frame, grid)
 >>> cells = Cells.of(readings, samples, predictions)
