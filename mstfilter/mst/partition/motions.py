@@ -1,8 +1,8 @@
 """Which predicted objects have moved as one body.
 
-Two things that move together through a push are more probably one thing: what is one must move as one, two things
-that touch do so only if the push happens to be along both. So common motion is evidence of "one object". How strong it
-is, says the coefficient `together` of `PairEvidence`; by default it is 0.
+Two things that move together through a push are more probably one thing: one thing must move as one, while two that
+touch do so only if they are pushed as one. So common motion is evidence of "one object". How strong it is says the
+coefficient `together` of `PairEvidence`; by default it is 0.
 
 >>> bodies = common_motions(hypothesis)                 # number of the body of each label, 0 at rest
 >>> bodies[a] == bodies[b] > 0                          # the objects a and b moved, and as one body

@@ -8,7 +8,8 @@ The two primary endpoints are means over pauses t >= 1. *Quality* is the unweigh
 recalibration on other scenes; lower is better (see `mstfilter.scoring.log_loss`). Other metrics are averaged over the
 same pauses. Values are averaged over filter seeds first, then over scenes. A difference is the value of an arm minus
 the value of the reference: arms are paired by scene, and in a scene by the filter seeds that both have (`summarise`,
-then `mstfilter.scoring.statistics.compare`). The p values of both endpoints, and of the study's own metrics, are adjusted together.
+then `mstfilter.scoring.statistics.compare`). The p values of both endpoints, and of the study's own metrics, are
+adjusted together.
 """
 
 from __future__ import annotations
