@@ -91,7 +91,7 @@ class SeamSamples(Samples):
                 f"labels {labels.shape} up to {labels.max()}", f"expected {frame.depth.shape} and at most 255 objects"
             )
         rng = np.random.default_rng(index)
-        if not (rows := [*_regions(rng, frame, grid, np.maximum(labels, 0), True, tree or BorderTree())]):
+        if not (rows := [*_regions(rng, frame, grid, np.maximum(labels, 0), False, tree or BorderTree())]):
             raise InputError("the image shows no region that is examined")
         return cls._of_rows(rows, 1000 * index)
 

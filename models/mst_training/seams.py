@@ -4,9 +4,12 @@
 
 A batch is a set of regions. If a region is one object, its loss is -log P(one); else it is -log of the probability of
 all divisions that separate its objects cleanly, or -log(1 - P(one)) if there is none. So the judge need not choose
-among divisions that are equally good. Strips are mirrored, and their colours are weakened or taken away. With
-`extra`, regions of labelled images join each batch. At the end, scale and shift of the scores are fitted to the
-validation samples.
+among divisions that are equally good. How often a region is one object differs between scenes with groups, other
+simulated scenes and real images. This share is no property of what is seen, so the loss takes it as known, and the
+scores are those for even odds: the prior is the field `one_share` of `SeamTree`.
+
+Strips are mirrored, and their colours are weakened or taken away. With `extra`, regions of labelled images join each
+batch. At the end, scale and shift of the scores are fitted to the validation samples.
 """
 
 from __future__ import annotations
@@ -64,15 +67,13 @@ class SeamsTraining(Training):
         return {"net": SeamNet(self.width)}
 
     def batches(self, samples: SeamSamples, first: int, last: int) -> Iterator[tuple[Tensor, ...]]:
-        """Inputs, strips, purities, number of the region of each division, and the objects of each region."""
-        rows, further = _by_region(samples), self._extra()
-        extra_rows = [] if further is None else _by_region(further)
-        for step, chosen in self.order(len(rows), first, last):
+        """Inputs, strips, purities, number of the region of each division; objects and prior of each region."""
+        source, further = _Source.of(samples), self._extra()
+        for step, chosen in self.order(len(source.rows), first, last):
             rng = np.random.default_rng([self.seed, 2, step])
-            batch = _batch(samples, [rows[k] for k in chosen.tolist()])
+            batch = source.batch(chosen)
             if further is not None:
-                drawn = rng.integers(len(extra_rows), size=self.extra_batch).tolist()
-                batch = _joined(batch, _batch(further, [extra_rows[k] for k in drawn]))
+                batch = _joined(batch, further.batch(rng.integers(len(further.rows), size=self.extra_batch)))
             x, strips, *others = batch
             if rng.uniform() < 0.5:
                 strips = strips.flip(3)[:, [1, 0, *range(2, len(STRIP_CHANNELS))]]
@@ -80,14 +81,14 @@ class SeamsTraining(Training):
             strips[:, _COLOURS] *= 0.0 if rng.uniform() < self.colour_dropout else float(rng.uniform(0.5, 1.2))
             yield x, strips, *others
 
-    def _extra(self) -> SeamSamples | None:
+    def _extra(self) -> _Source | None:
         if not self.extra:
             return None
         without = {name.strip() for name in self.extra_without.split(",")}
         files = sorted(path for path in Path(self.extra).glob("*.npz") if path.stem not in without)
         if not files:
             raise InputError(f"{self.extra} has no files of samples", "an npz file of SeamSamples for each sequence")
-        return SeamSamples.read(files)
+        return _Source.of(SeamSamples.read(files))
 
     def loss(
         self, networks: Mapping[str, Any], step: int, batch: Sequence[Tensor]
@@ -102,17 +103,17 @@ class SeamsTraining(Training):
         return total, (float(total.detach()),)
 
     def validate(self, net: SeamNet, samples: SeamSamples, device: torch.device) -> dict[str, float]:
-        return _figures(_judged(net, samples, device))
+        return _figures(_judged(net, _Source.of(samples), device))
 
     def finish(
         self, net: SeamNet, validation: SeamSamples, test: SeamSamples, device: torch.device
     ) -> tuple[dict[str, Any], dict[str, float], list[dict[str, Any]]]:
-        scale, shift = _calibrated(_judged(net, validation, device))
-        judged = _judged(net, test, device)
-        scores, purity, region, objects = judged
-        calibrated = (scale * scores + shift, purity, region, objects)
+        scale, shift = _calibrated(_judged(net, _Source.of(validation), device))
+        source = _Source.of(test)
+        scores, *truth = _judged(net, source, device)
+        calibrated = (scale * scores + shift, *truth)
         table: list[dict[str, Any]] = []
-        grouped = np.array([test.grouped[rows[0]] for rows in _by_region(test)])
+        grouped = np.array([test.grouped[rows[0]] for rows in source.rows])
         for name, chosen in (("all", grouped >= 0), ("groups", grouped), ("other scenes", ~grouped)):
             table.append({"scenes": name, **_figures(calibrated, torch.from_numpy(chosen))})
         described = {
@@ -122,12 +123,16 @@ class SeamsTraining(Training):
         return described, dict(list(table[0].items())[1:]), table
 
 
-def region_losses(scores: Tensor, purity: Tensor, region: Tensor, objects: Tensor) -> tuple[Tensor, Tensor]:
+def region_losses(
+    scores: Tensor, purity: Tensor, region: Tensor, objects: Tensor, prior: Tensor
+) -> tuple[Tensor, Tensor]:
     """The losses (r,) of regions and their log P(one), from the scores (k,) of all divisions.
 
-    `purity` (k,), number of the `region` (k,) of each division, and number of `objects` (r,) of each region.
+    `purity` (k,), number of the `region` (k,) of each division, number of `objects` (r,) of each region, and `prior`
+    (r,) log odds of "one".
     """
     n = len(objects)
+    scores = scores - prior[region].to(scores.dtype)
     zero = torch.zeros(n, dtype=scores.dtype, device=scores.device)
     top = zero.scatter_reduce(0, region, scores.detach(), "amax")  # at least the 0 of "one"
     odds = torch.exp(scores - top[region])
@@ -140,6 +145,38 @@ def region_losses(scores: Tensor, purity: Tensor, region: Tensor, objects: Tenso
     log_one = -log_total
     log_right = torch.log(right + 1e-30) + top - log_total
     return -torch.where(objects < 2, log_one, log_right), log_one
+
+
+@dataclass(frozen=True, eq=False)
+class _Source:
+    """Samples by region, with the share of "one" among scenes of a kind."""
+
+    samples: SeamSamples
+    rows: list[np.ndarray]  # of each region
+    prior: np.ndarray  # (r,) log odds of "one" among the regions of such scenes that are no side of a division
+
+    @classmethod
+    def of(cls, samples: SeamSamples) -> _Source:
+        rows = _by_region(samples)
+        first = np.array([own[0] for own in rows])
+        grouped, top, one = samples.grouped[first], samples.depth[first] == 0, samples.objects[first] < 2
+        prior = np.zeros(len(rows))
+        for kind in (False, True):
+            known = one[(grouped == kind) & top]
+            prior[grouped == kind] = np.log((known.sum() + 1) / ((~known).sum() + 1))
+        return cls(samples, rows, prior)
+
+    def batch(self, chosen: np.ndarray) -> tuple[Tensor, ...]:
+        """The regions with these numbers (b,), as `SeamsTraining.batches` has them."""
+        regions = [self.rows[k] for k in chosen]
+        rows = np.concatenate(regions)
+        of = np.repeat(np.arange(len(regions)), [len(one) for one in regions])
+        objects = self.samples.objects[[one[0] for one in regions]].astype(np.int64)
+        return (
+            *(torch.from_numpy(np.nan_to_num(self.samples.x[rows])), decoded(self.samples.strip[rows])),
+            *(torch.from_numpy(self.samples.purity[rows]), torch.from_numpy(of)),
+            *(torch.from_numpy(objects), torch.from_numpy(self.prior[chosen])),
+        )
 
 
 def _by_region(samples: SeamSamples) -> list[np.ndarray]:
@@ -158,39 +195,26 @@ def _by_region(samples: SeamSamples) -> list[np.ndarray]:
     ]
 
 
-def _batch(samples: SeamSamples, regions: list[np.ndarray]) -> tuple[Tensor, ...]:
-    rows = np.concatenate(regions)
-    of = np.repeat(np.arange(len(regions)), [len(one) for one in regions])
-    first = [one[0] for one in regions]
-    x = torch.from_numpy(np.nan_to_num(samples.x[rows]))
-    return (
-        *(x, decoded(samples.strip[rows]), torch.from_numpy(samples.purity[rows])),
-        *(torch.from_numpy(of), torch.from_numpy(samples.objects[first].astype(np.int64))),
-    )
-
-
 def _joined(one: tuple[Tensor, ...], other: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
     """Two batches as one."""
     n = len(one[4])  # regions of the first one
-    other = (*other[:3], other[3] + n, other[4])
+    other = (*other[:3], other[3] + n, *other[4:])
     return tuple(torch.cat(pair) for pair in zip(one, other, strict=True))
 
 
-_Judged = tuple[Tensor, Tensor, Tensor, Tensor]  # scores, purity, region, objects: see `region_losses`
+_Judged = tuple[Tensor, ...]  # scores, purity, region, objects, prior: see `region_losses`
 
 
-def _judged(net: SeamNet, samples: SeamSamples, device: torch.device) -> _Judged:
+def _judged(net: SeamNet, source: _Source, device: torch.device) -> _Judged:
     """The scores of all divisions, region by region."""
-    rows = _by_region(samples)
     net.eval()
     found: list[tuple[Tensor, ...]] = []
     with torch.inference_mode():
-        for k in range(0, len(rows), 64):
-            x, strips, purity, of, objects = _batch(samples, rows[k : k + 64])
-            found.append((net(x.to(device), strips.to(device)).cpu(), purity, of + k, objects))
+        for k in range(0, len(source.rows), 64):
+            x, strips, purity, of, *regions = source.batch(np.arange(k, min(k + 64, len(source.rows))))
+            found.append((net(x.to(device), strips.to(device)).cpu(), purity, of + k, *regions))
     net.train()
-    scores, purity, of, objects = (torch.cat(column) for column in zip(*found, strict=True))
-    return scores, purity, of, objects
+    return tuple(torch.cat(column) for column in zip(*found, strict=True))
 
 
 def _figures(judged: _Judged, chosen: Tensor | None = None) -> dict[str, float]:

@@ -58,8 +58,9 @@ def test_region_losses_are_those_of_the_formula():
     purity = torch.tensor([0.96, 0.97, 0.2, 0.1, 0.0, 0.99])
     region = torch.tensor([0, 0, 0, 1, 2, 3])
     objects = torch.tensor([2, 1, 3, 2])
-    losses, log_one = region_losses(scores, purity, region, objects)
-    odds = torch.exp(scores)
+    prior = torch.tensor([0.0, 1.5, 0.0, -1.0])  # log odds of "one" that the loss takes as known
+    losses, log_one = region_losses(scores, purity, region, objects, prior)
+    odds = torch.exp(scores - prior[region])
     one = 1 / (1 + torch.stack([odds[:3].sum(), odds[3], odds[4], odds[5]]))
     assert torch.allclose(log_one, torch.log(one))
     expected = [-torch.log((odds[0] + odds[1]) * one[0]), -torch.log(one[1]), -torch.log(odds[4] * one[2]), 0.0]
@@ -69,10 +70,11 @@ def test_region_losses_are_those_of_the_formula():
 def test_scores_of_one_region_do_not_depend_on_the_others():
     scores, purity = torch.randn(7, generator=torch.Generator().manual_seed(0)), torch.rand(7)
     region, objects = torch.tensor([0, 0, 1, 1, 1, 2, 2]), torch.tensor([1, 2, 2])
-    together = region_losses(scores, purity, region, objects)[0]
+    prior = torch.zeros(3)
+    together = region_losses(scores, purity, region, objects, prior)[0]
     for k in range(3):
         own = region == k
-        alone = region_losses(scores[own], purity[own], region[own] - k, objects[[k]])[0]
+        alone = region_losses(scores[own], purity[own], region[own] - k, objects[[k]], prior[[k]])[0]
         assert torch.allclose(alone, together[[k]])
 
 
