@@ -11,8 +11,13 @@ the base tree has a clear division, this stays, and only its odds are those of t
 >>> tree = SeamTree().build(boundary, frame)
 >>> w = MergeLogOdds().values(tree, frame)
 
-The judge was trained on scenes in which things that look like two objects are one as often as not. How often that is
-so where the filter is used is a prior, the field `one_share`.
+**The prior.** The judge's odds are those where one object and several are equally frequent. How often what may be
+several is one differs from table to table: office things have many parts, groceries in a row are many things. So the
+share of "one" is unknown in each image, with a Beta distribution of mean `one_share` that is worth `prior_size`
+regions, and the regions of the image tell more about it (`SharedPrior`). Where the share is known, give it with a
+large `prior_size`:
+
+>>> tree = SeamTree(one_share=0.3, prior_size=1000)     # seven of ten are several, whatever the image shows
 """
 
 from __future__ import annotations
@@ -20,13 +25,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import log
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
+from scipy.special import expit
 
 from mstfilter.base.errors import InputError
-from mstfilter.base.fields import Bounds, Share
-from mstfilter.mst.segmentation.divisions import Division, SeamImage, TreePart, divisions
+from mstfilter.base.fields import Bounds, PositiveFloat, Share
+from mstfilter.mst.segmentation.divisions import SeamImage, TreePart, divisions
 from mstfilter.mst.segmentation.learned_tree import BorderTree, tree_of_merges
 from mstfilter.mst.segmentation.regions import Regions
 from mstfilter.mst.segmentation.seam_measures import SeamMeasures
@@ -44,6 +50,8 @@ _LEAST_PIXELS = 400  # of a region that is examined, in an image of 640 x 480
 _MOST_DEPTH = 4  # divisions of a region that follow one another
 _FOLLOWED = -1.5  # log odds of a division above which its sides are examined
 _MOST_MERGES = 8  # of the base tree that are examined in a region
+_SHARES = 200  # values of the share of "one"
+_RARE = 1e-12  # least probability of one object, and of several
 
 
 @dataclass(frozen=True)
@@ -57,14 +65,17 @@ class SeamTree(TreeBuilder):
     weights : str
         Name of a trained model of the package, or the path of a model folder: the judge.
     one_share : float
-        Prior probability that what may be one object or several is one. The judge was trained where it is 0.5.
+        Prior probability that what may be one object or several is one.
+    prior_size : float
+        Number of regions that the prior is worth. The default of both was fitted to simulated scenes and real images.
     least : float
         A region is divided in the tree if the probability that it is several objects is at least this.
     """
 
     base: BorderTree = field(default_factory=BorderTree)
     weights: str = "seams"
-    one_share: Annotated[float, Bounds(above=0, below=1)] = 0.5
+    one_share: Annotated[float, Bounds(above=0, below=1)] = 0.85
+    prior_size: PositiveFloat = 3.5
     least: Share = 0.02
 
     @property
@@ -88,6 +99,34 @@ class SeamTree(TreeBuilder):
         from mstfilter.mst.segmentation.seam_network import load_seam_network
 
         return load_seam_network(self.weights)
+
+
+@dataclass(frozen=True, eq=False)
+class SharedPrior:
+    """What the regions of an image say of one another: the share of "one" among them is the same, and unknown.
+
+    Given the share p, a region that is several objects with log odds l where both are equally frequent is one object
+    with probability ``p (1 - s) / (p (1 - s) + (1 - p) s)``, s = expit(l). The share has a Beta distribution.
+    """
+
+    shares: np.ndarray  #: (k,) values of the share
+    weights: np.ndarray  #: (k,) their probabilities, given the regions
+
+    @classmethod
+    def of(cls, log_odds: np.ndarray, mean: float, size: float) -> SharedPrior:
+        """The share given regions with log odds (r,), and a prior mean that is worth `size` regions."""
+        shares = (np.arange(_SHARES) + 0.5) / _SHARES
+        several = expit(np.asarray(log_odds, float))
+        likelihood = np.log(np.outer(shares, 1 - several) + np.outer(1 - shares, several)).sum(axis=1)
+        log_p = likelihood + (size * mean - 1) * np.log(shares) + (size * (1 - mean) - 1) * np.log1p(-shares)
+        weights = np.exp(log_p - log_p.max())
+        return cls(shares, weights / weights.sum())
+
+    def log_odds(self, log_odds: float) -> float:
+        """Log odds of "several" of a region, from those where one object and several are equally frequent."""
+        one = self.weights @ expit(np.log(self.shares) - np.log1p(-self.shares) - log_odds)
+        one = np.clip(one, _RARE, 1 - _RARE)
+        return float(np.log1p(-one) - np.log(one))
 
 
 def least_examined(size: int) -> float:
@@ -167,6 +206,13 @@ class BaseTree:
         return [TreePart(self.regions_of(child), odds) for *children, odds in known for child in children]
 
 
+class _Judged(NamedTuple):
+    """What the judge says of a region, where one object and several are equally frequent."""
+
+    log_odds: float  #: of "several objects" against "one"
+    side: np.ndarray | None  #: (n,) bool, the first side of the most probable division; None without divisions
+
+
 class _Examination:
     """Builds the tree of one image."""
 
@@ -182,9 +228,12 @@ class _Examination:
         self.base = BaseTree(regions.image, len(regions.sums), merges)
         self.clear, self.uncertain = frozenset(self.base.clear()), frozenset(self.base.uncertain())
         self.flat = regions.image.ravel()
-        self.measures = SeamMeasures.of(image, regions.image > 0)
-        self.prior = log(builder.one_share / (1 - builder.one_share))
         self.least = least_examined(self.flat.size)
+        self.measures = SeamMeasures.of(image, regions.image > 0)
+        self.judged = {node: self._judged(*self.base.region(node), False) for node in self.clear | self.uncertain}
+        log_odds = np.array([one.log_odds for one in self.judged.values() if np.isfinite(one.log_odds)])
+        self.prior = SharedPrior.of(log_odds, builder.one_share, builder.prior_size)
+        self.least_odds = log(max(builder.least, 1e-9) / max(1 - builder.least, 1e-9))
         self.leaves = np.zeros_like(self.flat)  # of the new tree
         self.n_leaves = 1
         self.joins: list[tuple[tuple[str, int], tuple[str, int], float]] = []
@@ -209,35 +258,40 @@ class _Examination:
 
     def _upper(self, node: int) -> tuple[str, int]:
         if node in self.uncertain:
-            return self._examined(node, *self.base.region(node), depth=0)
+            pixels, parts = self.base.region(node)
+            return self._examined(node, pixels, parts, self.judged[node], depth=0)
         merge = self.base.merge_of(node)
         assert merge is not None
         a, b, odds = merge
-        if node in self.clear:
-            pixels, parts = self.base.region(node)
-            if len(pixels) >= self.least and (found := divisions(self.image, pixels, parts)):
-                odds = self._judged(pixels, found, False)[0]
+        if node in self.clear and self.judged[node].side is not None:
+            odds = self.prior.log_odds(self.judged[node].log_odds)
         return self._join(self._upper(a), self._upper(b), odds)
 
-    def _examined(self, node: int, pixels: np.ndarray, parts: Sequence[TreePart], depth: int) -> tuple[str, int]:
+    def _examined(
+        self, node: int, pixels: np.ndarray, parts: Sequence[TreePart], judged: _Judged, depth: int
+    ) -> tuple[str, int]:
         """The subtree of some pixels (n,) below a node of the base tree; `parts` are those of `divisions`."""
-        if depth <= _MOST_DEPTH and len(pixels) >= self.least:
-            found = divisions(self.image, pixels, parts)
-            log_odds, best = self._judged(pixels, found, depth > 0)
-            if log_odds > np.log(self.builder.least / (1 - self.builder.least)):
-                # The sides of an improbable division are seldom in a sample, so they are not examined.
-                depth = depth + 1 if log_odds > _FOLLOWED else _MOST_DEPTH + 1
-                side = found[best].side
-                below = [self._examined(node, pixels[one], within(parts, one), depth) for one in (side, ~side)]
-                return self._join(below[0], below[1], float(log_odds))
-        return self._kept(node, pixels)
+        if judged.side is None:
+            return self._kept(node, pixels)
+        odds = self.prior.log_odds(judged.log_odds)
+        if odds <= self.least_odds:
+            return self._kept(node, pixels)
+        # The sides of an improbable division are seldom in a sample, so they are not examined.
+        further = odds > _FOLLOWED and depth < _MOST_DEPTH
+        sides = []
+        for one in (judged.side, ~judged.side):
+            own = within(parts, one)
+            below = self._judged(pixels[one], own, True) if further else _Judged(-np.inf, None)
+            sides.append(self._examined(node, pixels[one], own, below, depth + 1))
+        return self._join(sides[0], sides[1], odds)
 
-    def _judged(self, pixels: np.ndarray, found: list[Division], below: bool) -> tuple[float, int]:
-        """Log odds of "several objects" against "one", and the index of the most probable division."""
+    def _judged(self, pixels: np.ndarray, parts: Sequence[TreePart], below: bool) -> _Judged:
+        """What the judge says of a region."""
+        found = divisions(self.image, pixels, parts) if len(pixels) >= self.least else []
         if not found:
-            return -np.inf, -1
+            return _Judged(-np.inf, None)
         scores = self.judge.scores(*self.measures.describe(pixels, found, below))
-        return float(np.logaddexp.reduce(scores)) - self.prior, int(scores.argmax())
+        return _Judged(float(np.logaddexp.reduce(scores)), found[int(scores.argmax())].side)
 
     def _kept(self, node: int, pixels: np.ndarray) -> tuple[str, int]:
         """The base tree below a node, restricted to some pixels. Without merges that divide objects."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 import torch
@@ -15,7 +17,7 @@ from mstfilter.mst.segmentation.learned_tree import FEATURES, pair_features
 from mstfilter.mst.segmentation.regions import measure_regions
 from mstfilter.mst.segmentation.seam_measures import SEAM_FEATURES, STRIP, STRIP_CHANNELS, SeamMeasures
 from mstfilter.mst.segmentation.seam_network import INPUTS, SEAM_ARCHITECTURE, SeamNet
-from mstfilter.mst.segmentation.seams import BaseTree, _Examination
+from mstfilter.mst.segmentation.seams import BaseTree, SharedPrior, _Examination, _Judged
 from mstfilter.scene import Frame, pixels_above_table, render
 from tests.mst.segmentation.scenes import GRID, boxes, camera, frame_of
 
@@ -133,7 +135,8 @@ def test_a_sure_judge_keeps_the_regions_of_the_base_tree(touching, judges):
 def test_odds_of_a_division_are_those_of_the_judge_and_the_prior(touching, judges):
     frame, image, _, _ = touching
     shares = (0.5, 0.8)
-    trees = [SeamTree(weights=judges[-2.0], one_share=share).build(image.boundary, frame) for share in shares]
+    known = {"weights": judges[-2.0], "prior_size": 1e5}
+    trees = [SeamTree(one_share=share, **known).build(image.boundary, frame) for share in shares]
     inner = [tree.odds[tree.n_leaves :] for tree in trees]
     odds = [found[found > -4.9] for found in inner]
     for share, found in zip(shares, odds, strict=True):
@@ -141,16 +144,38 @@ def test_odds_of_a_division_are_those_of_the_judge_and_the_prior(touching, judge
         assert len(n) > 1 and np.allclose(n, np.rint(n), atol=0.05) and n.min() > 0.9
 
 
+def test_regions_share_their_prior():
+    """By enumeration: regions are one or several, their share is a grid, and the readings have known likelihoods."""
+    log_odds, mean, size = np.array([1.0, -2.0, 0.5, -0.3]), 0.7, 3.0
+    prior = SharedPrior.of(log_odds, mean, size)
+    grid = (np.arange(4000) + 0.5) / 4000
+    density = grid ** (size * mean - 1) * (1 - grid) ** (size * (1 - mean) - 1)
+    joint = {}
+    for states in itertools.product((0, 1), repeat=4):  # 1: several
+        p = np.prod([np.exp(l * s) for l, s in zip(log_odds, states, strict=True)])
+        joint[states] = p * np.mean(density * grid ** (4 - sum(states)) * (1 - grid) ** sum(states))
+    total = sum(joint.values())
+    for k, value in enumerate(log_odds):
+        several = sum(p for states, p in joint.items() if states[k]) / total
+        assert prior.log_odds(value) == pytest.approx(np.log(several / (1 - several)), abs=0.01)
+    fixed = SharedPrior.of(log_odds, mean, 1e5)
+    assert fixed.log_odds(1.0) == pytest.approx(1.0 - np.log(0.7 / 0.3), abs=0.02)
+    alone = SharedPrior.of(np.zeros(0), mean, size)
+    assert alone.log_odds(0.0) == pytest.approx(-np.log(0.7 / 0.3), abs=0.01)
+    assert np.isfinite(alone.log_odds(-np.inf)) and np.isfinite(alone.log_odds(1e4))
+
+
 def test_both_sides_of_the_true_seam_are_nodes(touching, judges, monkeypatch):
     frame, image, pixels, truth = touching
     label = np.zeros(frame.depth.size, int)
     label[pixels] = truth
 
-    def knowing(self, pixels, found, below):
+    def knowing(self, pixels, parts, below):
         """The judge that knows the objects: even odds where there are two."""
         if min(np.bincount(label[pixels], minlength=3)[1:]) < 0.1 * len(pixels):
-            return -20.0, -1
-        return 0.0, int(np.argmax([agreement(one.side, label[pixels]) for one in found]))
+            return _Judged(-20.0, None)
+        found = divisions(image, pixels, parts)
+        return _Judged(0.0, max(found, key=lambda one: agreement(one.side, label[pixels])).side)
 
     monkeypatch.setattr(_Examination, "_judged", knowing)
     built = SeamTree(weights=judges[5.0]).build(image.boundary, frame)
