@@ -12,8 +12,8 @@ a model with parameters is a function that returns a filter, and the prior is a 
 >>> chains = pmmh(filter_of, observations, prior, scale={"rho": 0.1, "sigma": 0.1}, n_iterations=5000)
 >>> chains["rho"][1000:].mean(), chains.autocorrelation_times()
 
-Without names, parameters are an array (d,): then the prior is a distribution of vectors, or a function that returns
-the log density, and `start` and `scale` are arrays.
+Without names, parameters are a number or an array (d,): then the prior is a distribution of these, or a function of
+arrays that returns the log density, and `start` and `scale` are arrays.
 
 - `pmmh` is such a Metropolis chain.
 - `ensemble` runs the ensemble sampler emcee with the same estimates. It needs no scale of the steps.
@@ -125,10 +125,12 @@ class _Parameters:
 
     def __init__(self, prior: Any, start: Any) -> None:
         self.names: tuple[str, ...] = ()
+        self.number = False  #: whether the only parameter is a number, as the prior draws it
         self.prior: Distribution | None = None
         if not callable(prior):
             self.prior = as_distribution(prior)
             self.names = tuple(self.prior.parts) if isinstance(self.prior, Joint) else ()
+            self.number = not self.names and self.prior.event_shape == ()
             prior = self.prior.log_prob
         if isinstance(start, Mapping) and self.prior is None:
             self.names = tuple(map(str, start))
@@ -142,8 +144,10 @@ class _Parameters:
         return found.item()
 
     def form(self, theta: np.ndarray) -> Any:
-        """What `filter_of` and the prior get: a mapping from names to entries of ``theta``, or the array itself."""
-        return dict(zip(self.names, theta, strict=True)) if self.names else theta
+        """What `filter_of` and the prior get: entries of ``theta`` by name, the only entry, or the array itself."""
+        if self.names:
+            return dict(zip(self.names, theta, strict=True))
+        return theta[0] if self.number else theta
 
     def start(self, given: Any, n: int | None, rng: np.random.Generator) -> np.ndarray:
         """(R, d) first parameters. Without any, `n` draws from the prior; None stands for 4 d."""
@@ -280,8 +284,9 @@ def pmmh(
     Parameters
     ----------
     filter_of : callable
-        ``(theta) -> ParticleFilter``. The components of the filter must be properly weighted. If the parameters have
-        names, ``theta`` is a mapping from names to numbers, otherwise an array (d,).
+        ``(theta) -> ParticleFilter``. The components of the filter must be properly weighted. ``theta`` is what the
+        prior draws, as in `smc2`: a mapping from names to numbers, an array (d,), or a number if the prior is a
+        distribution of numbers. It is an array (d,) if the prior is a function.
     prior : mapping, Distribution or callable
         A distribution for each name; a joint distribution, such as `Product`, `MultivariateNormal` or one of
         scipy.stats; or a function ``(theta) -> float``, the log density, -inf outside of the support.
@@ -291,7 +296,8 @@ def pmmh(
     scale : mapping, (d,) or (d, d) array_like
         Standard deviations or covariance of a step. A good choice is 2.4 / sqrt(d) posterior standard deviations.
     batched : bool
-        Whether ``filter_of`` also accepts parameters (d, m), or arrays (m,) by name, one for each of the m particles.
+        Whether ``filter_of`` also accepts arrays (m,) in place of numbers, or (d, m) in place of (d,): parameters for
+        each of the m particles.
         The filters of all chains then run as one batch. To combine a parameter with particles (n, k), use
         ``theta[0][..., None]``. If a component looks at several particles, the filters run one by one, with a
         warning.
