@@ -5,12 +5,17 @@ without bias, and an unbiased estimate in place of the exact value leaves the po
 if the estimate of the present parameters is kept until a proposal is accepted (Andrieu, Doucet, Holenstein 2010). So
 a model with parameters is a function that returns a filter, and the prior is a distribution for each parameter:
 
+>>> from mstfilter.smc import Gamma, Normal, StateSpaceModel, Uniform, bootstrap, pmmh
+>>> def model_of(rho, sigma):
+...     return StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(rho * x, sigma), lambda x: Normal(x, 0.5))
 >>> def filter_of(theta):
-...     move = lambda x: Normal(theta["rho"] * x, theta["sigma"])
-...     return bootstrap(StateSpaceModel.of(Normal(0.0, 1.0), move, observation), n=200)
+...     return bootstrap(model_of(theta["rho"], theta["sigma"]), n=50)
+>>> states, observations = model_of(0.8, 0.5).simulate(20, seed=1)
 >>> prior = {"rho": Uniform(-1.0, 1.0), "sigma": Gamma(2.0, 0.5)}
->>> chains = pmmh(filter_of, observations, prior, scale={"rho": 0.1, "sigma": 0.1}, n_iterations=5000)
->>> chains["rho"][1000:].mean(), chains.autocorrelation_times()
+>>> chains = pmmh(filter_of, observations, prior, scale={"rho": 0.3, "sigma": 0.2}, n_iterations=50, n_chains=4)
+>>> chains["rho"].shape                                              # (iterations, chains)
+(50, 4)
+>>> mean, accepted = chains["rho"][20:].mean(), chains.accepted
 
 Without names, parameters are a number or an array (d,): then the prior is a distribution of these, or a function of
 arrays that returns the log density, and `start` and `scale` are arrays.
