@@ -138,8 +138,8 @@ class Update(Component):
         `predicted` are the moved particles, None at the first step of a filter that starts from its proposal.
         `proposed` are new particles; None if the filter has no proposal. The log weights of `predicted` contain the
         likelihoods of all earlier observations and those of `proposed` do not, so an update that keeps both must
-        bring them to one level, as `Reweight` does. Each particle of the result keeps the ``parents`` of the particles
-        from which it was made (see `union`).
+        bring them to one level, as `Reweight` does. Each particle of the result keeps the ``parents`` of the
+        particles from which it was made (see `union`).
         """
 
 
