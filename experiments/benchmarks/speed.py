@@ -65,12 +65,7 @@ def program(previous, y):
 
 def data(T: int) -> list[float]:
     """T observations simulated from the model."""
-    rng, ys = np.random.default_rng(4), []
-    x = rng.normal(0, SD0)
-    for _ in range(T):
-        ys.append(float(rng.normal(x, TAU)))
-        x = rng.normal(RHO * x, SIGMA)
-    return ys
+    return MODEL.simulate(T, seed=4)[1].tolist()
 
 
 @dataclass(frozen=True)

@@ -34,15 +34,6 @@ def guide(previous, y):
         sample("x", Normal(m + GAIN * (y - m), np.sqrt(GAIN) * Q))
 
 
-def simulate(T: int, seed: int = 0) -> tuple[np.ndarray, list[float]]:
-    """Simulate T steps; returns the states (T,) and the observations."""
-    rng = np.random.default_rng(seed)
-    x = [rng.normal(0, S / np.sqrt(1 - R**2))]
-    for _ in range(T - 1):
-        x.append(R * x[-1] + S * rng.normal())
-    return np.array(x), [float(v + Q * rng.normal()) for v in x]
-
-
 def filters(n: int) -> dict:
     """The filters of the program with `n` particles, by name."""
     program = Program(model)
@@ -53,10 +44,10 @@ def filters(n: int) -> dict:
 
 
 if __name__ == "__main__":
-    truth, observations = simulate(50)
+    truth, observations = Program(model).simulate(50)
     for name, filter in filters(500).items():
         state, infos = filter.run(observations, seed=1)
-        estimate = state.population.weights @ state.population.particles["x"]
+        estimate = state.population.mean()["x"]
         smallest = min(info.ess for info in infos)
         print(f"{name:14s} log evidence {state.log_evidence:8.3f}  smallest ESS {smallest:5.0f}  x {estimate:6.3f}")
-    print(f"{'truth':14s} x {truth[-1]:6.3f}")
+    print(f"{'truth':14s} x {truth['x'][-1]:6.3f}")

@@ -4,7 +4,7 @@
 
 A shelf contains boxes. At each step a box of random colour is added, or one is removed, or nothing happens. A sensor
 counts the boxes and misses each with probability 0.2. A particle is the shelf: a tuple of colours. A model of objects
-is a `StateSpaceModel` of three functions.
+is a `StateSpaceModel` of functions.
 """
 
 from __future__ import annotations
@@ -38,16 +38,8 @@ model = StateSpaceModel(
     sample_initial=lambda rng, n: tuple(changed(rng, ()) for _ in range(n)),
     sample_transition=lambda rng, shelves: tuple(changed(rng, shelf) for shelf in shelves),
     log_likelihood=log_likelihood,
+    sample_observation=lambda rng, shelves: rng.binomial([len(shelf) for shelf in shelves], SEEN),
 )
-
-
-def simulate(T: int, seed: int = 0) -> tuple[list[tuple], list[int]]:
-    """Simulate T steps; returns the shelves and the counts."""
-    rng, shelf, shelves = np.random.default_rng(seed), (), []
-    for _ in range(T):
-        shelf = changed(rng, shelf)
-        shelves.append(shelf)
-    return shelves, [int(rng.binomial(len(shelf), SEEN)) for shelf in shelves]
 
 
 def filters(n: int) -> dict:
@@ -56,8 +48,8 @@ def filters(n: int) -> dict:
 
 
 if __name__ == "__main__":
-    shelves, counts = simulate(20)
+    shelves, counts = model.simulate(20)
     state, infos = filters(300)["bootstrap"].run(counts, seed=1)
-    sizes = np.array([len(shelf) for shelf in state.population.particles])
+    boxes = state.population.mean(lambda shelves: np.array([len(shelf) for shelf in shelves]))
     print(f"log evidence {state.log_evidence:.3f}")
-    print(f"boxes: {state.population.weights @ sizes:.2f} expected, {len(shelves[-1])} true, {counts[-1]} counted")
+    print(f"boxes: {boxes:.2f} expected, {len(shelves[-1])} true, {counts[-1]} counted")

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mstfilter.smc import Normal, Program, Uniform, observe, sample, switch
+from mstfilter.smc import Normal, Program, Uniform, collect, mean, observe, sample, switch
 
 STEP, NOISE = 1.0, 0.5
 TO_MANOEUVRE = np.array([0.1, 0.6])  # probability of a manoeuvre after a drift, after a manoeuvre
@@ -40,38 +40,18 @@ def model(previous, y):
     return None
 
 
-def simulate(T: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, list]:
-    """Simulate T steps; returns positions (T, 2), regimes (T,) and readings, of which a tenth are missing (None)."""
-    rng = np.random.default_rng(seed)
-    position, velocity, regime = rng.normal(0, 5, 2), rng.normal(0, 1, 2), 0
-    positions, regimes, readings = [], [], []
-    for t in range(T):
-        if t:
-            regime = int(rng.random() < TO_MANOEUVRE[regime])
-            if regime:
-                angle = rng.uniform(-np.pi, np.pi)
-                velocity = velocity + 1.5 * np.array([np.cos(angle), np.sin(angle)]) + rng.normal(0, 0.3, 2)
-            else:
-                velocity = velocity + rng.normal(0, 0.05, 2)
-            position = position + STEP * velocity + rng.normal(0, 0.1, 2)
-        positions.append(position)
-        regimes.append(regime)
-        readings.append(None if t and rng.random() < 0.1 else position + NOISE * rng.normal(size=2))
-    return np.array(positions), np.array(regimes), readings
-
-
 def filters(n: int) -> dict:
     """The filters of the program with `n` particles, by name."""
     return {"bootstrap": Program(model).bootstrap(n)}
 
 
 if __name__ == "__main__":
-    truth, regimes, readings = simulate(60)
+    truth, readings = Program(model).simulate(60, seed=1)
+    lost = np.random.default_rng(0).random(60) < 0.1  # a tenth of the readings is missing
+    given = [None if t and lost[t] else reading for t, reading in enumerate(readings)]
     for name, filter in filters(3000).items():
-        errors, right = [], []
-        for state, info in filter.iterate(readings, 1):
-            w, p = state.population.weights, state.population.particles
-            errors.append(np.linalg.norm(w @ p["position"] - truth[info.t]))
-            right.append((w @ (p["regime"] == 1) > 0.5) == regimes[info.t])
-        print(f"{name:14s} position error {np.mean(errors):.3f}  regime right {np.mean(right):.2f}")
+        history = collect(filter.iterate(given, 1), mean=mean)
+        error = np.linalg.norm(history["mean_position"] - truth["position"], axis=1).mean()
+        right = ((history["mean_regime"] > 0.5) == truth["regime"]).mean()
+        print(f"{name:14s} position error {error:.3f}  regime right {right:.2f}")
     print(f"{'readings':14s} position error {NOISE * np.sqrt(np.pi / 2):.3f} (if not missing)")

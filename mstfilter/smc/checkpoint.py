@@ -1,14 +1,24 @@
 """Stores the state of a run, so that a new process can continue the run with identical results.
 
->>> for state, info in filter.iterate(observations, seed):
-...     save_state(path, state)
->>> state = load_state(path)                                         # later, or in another process
+The random numbers of a step are named by seed, step and component (`mstfilter.smc.streams`), and no generator runs
+along. So the rest of a run depends on the `State` alone: the number of observations, the weighted particles, and the
+key of the seed. That is what the file holds:
+
+>>> from mstfilter.smc import Normal, StateSpaceModel, bootstrap, load_state, save_state
+>>> model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 1.0))
+>>> states, observations = model.simulate(50, seed=1)
+>>> filter = bootstrap(model, n=100)
+>>> for state, info in filter.iterate(observations[:20], seed=0):
+...     save_state("run.npz", state)                                 # killed after 20 steps
+>>> state = load_state("run.npz")                                    # later, or in another process
 >>> state, infos = filter.run(observations[state.t:], state)
+>>> state.log_evidence == filter.run(observations, seed=0)[0].log_evidence
+True
 
 The file is an .npz of plain arrays, read and written without pickle. Loading it never imports code. The file is
 written under a temporary name and then renamed, so it holds the state of a complete step even if the process is
-killed. A continued run has the results of an uninterrupted run. The file stores no filter and no observations: pass
-both to the continued run. Particles that are neither arrays nor mappings of arrays need a `Codec`.
+killed. The file stores no filter and no observations: pass both to the continued run. Particles that are neither
+arrays nor mappings of arrays need a `Codec`.
 """
 
 from __future__ import annotations
@@ -31,13 +41,13 @@ from mstfilter.smc.streams import Key
 _FORMAT = 1
 
 
-def save_state(path: Path, state: State, codec: Codec | None = None, *, compress: bool = False) -> None:
+def save_state(path: Path | str, state: State, codec: Codec | None = None, *, compress: bool = False) -> None:
     """Write a state to an .npz file, atomically. The run must have made a step, and the folder must exist.
 
     `codec` encodes particles that `ArrayCodec` cannot store. `compress` makes the file smaller and writing slower.
     Raises InputError if the particles cannot be stored or the file cannot be written.
     """
-    population = state.population
+    path, population = Path(path), state.population
     if population is None:
         raise InputError("a state without particles cannot be stored", "store it after a step")
     head = {
@@ -57,11 +67,12 @@ def save_state(path: Path, state: State, codec: Codec | None = None, *, compress
         (np.savez_compressed if compress else np.savez)(file, allow_pickle=False, **arrays)
 
 
-def load_state(path: Path, codec: Codec | None = None, *, limit: int = 2**40) -> State:
+def load_state(path: Path | str, codec: Codec | None = None, *, limit: int = 2**40) -> State:
     """The state stored in a file.
 
     Raises InputError if the file is missing, damaged or no checkpoint, or if its arrays need more than `limit` bytes.
     """
+    path = Path(path)
     if not path.exists():
         raise InputError(f"checkpoint is missing: {path}")
     arrays = read_arrays(path, "a checkpoint", _DAMAGED, limit=limit)

@@ -43,7 +43,8 @@ from mstfilter.smc.population import Population, as_matrix, union
 class Reweight(Update):
     """Adds ``log_likelihood(particles, observation)`` (n,) to the log weights, as in the bootstrap filter.
 
-    Proposed particles, if any, are appended to the predicted particles.
+    Proposed particles, if any, are appended to the predicted particles, with the mean weight that these have: the
+    weights of predicted particles contain the likelihoods of all earlier observations, those of proposed ones none.
     """
 
     log_likelihood: Callable[[Any, Any], np.ndarray]
@@ -55,6 +56,9 @@ class Reweight(Update):
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Any
     ) -> Population:
+        if predicted is not None and proposed is not None:
+            level = predicted.log_mean_weight - proposed.log_mean_weight
+            proposed = proposed.reweighted(np.full(len(proposed), level))
         population = union(predicted, proposed)
         found = np.asarray(self.log_likelihood(population.particles, observation))
         if found.shape != population.log_weights.shape:

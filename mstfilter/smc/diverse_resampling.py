@@ -1,19 +1,28 @@
 """Resampling schemes that keep more distinct particles. The output weights are unequal.
 
-`FearnheadClifford` and `Chopthin` need only the weights. `ClusterStratified` compares particles by a `Similarity`.
+A copy of a particle says nothing that the particle does not say. If output weights may differ, a heavy particle can
+be kept once, with its weight, and the places go to others. `FearnheadClifford` keeps particle i with probability
+min(1, w_i / c) and gives it the weight max(w_i, c), where c is such that n particles are kept on average:
 
 >>> import numpy as np
->>> from mstfilter.smc import ClusterStratified, Gaussian, Population
+>>> from mstfilter.smc import ClusterStratified, FearnheadClifford, Gaussian, Population
 >>> rng = np.random.default_rng(0)
 >>> population = Population(np.array([0.0, 0.1, 0.2, 9.0]), np.log([3.0, 3.0, 3.0, 1.0]))
+>>> kept = FearnheadClifford().resample(rng, population, 3)
+>>> len(set(kept.particles)), float(np.exp(kept.log_weights).mean().round(6))     # the mean weight stays the same
+(3, 2.5)
 
-`ClusterStratified` forms groups of similar particles, and divides the n particles to select among the groups by
-weight: at least one per group if possible. It then selects inside each group. A light group thus keeps a particle,
-while schemes that use only weights usually drop it. The schemes of this module are unbiased.
+Among all unbiased schemes without duplicates, this one has the least expected squared error of the weights (Fearnhead
+and Clifford 2003). `Chopthin` duplicates too, but bounds the ratio of two output weights (Gandy and Lau 2016). Both
+need only the weights. `ClusterStratified` compares particles by a `Similarity`: it forms groups of similar particles,
+and divides the n particles to select among the groups by weight, at least one per group if possible. A light group
+thus keeps a particle, while schemes that use only weights usually drop it:
 
 >>> chosen = ClusterStratified(Gaussian(1.0)).resample(rng, population, 2)
 >>> float(chosen.particles[1]), chosen.weights
 (9.0, array([0.9, 0.1]))
+
+The schemes of this module are unbiased: the expected mean of w f(x) over the selected particles is that over all.
 """
 
 from __future__ import annotations

@@ -1,16 +1,23 @@
 """Observations, time and inputs: the values that a step passes to the functions of its components.
 
+A transition may depend on the time t and on an input u_t that is known, such as odometry, a control, or the time
+since the last observation: x_t ~ f_t(x_t | x_{t-1}, u_t). A function of a model that has a parameter ``t`` or ``u``
+gets them by keyword, and an observation brings the input of its step along:
+
+>>> from mstfilter.smc import Normal, StateSpaceModel, WithInput, bootstrap
 >>> model = StateSpaceModel.of(
 ...     initial=Normal(0.0, 1.0),
 ...     transition=lambda x, t, u: Normal(x + u, 0.1 * t),         # the index of the step, and its input
-...     observation=lambda x: Normal(x, 1.0),
+...     observation=lambda x: Normal(x, 0.2),
 ... )
->>> filter.run([WithInput(y, u) for y, u in zip(observations, odometry)])
+>>> observations = [WithInput(y, u) for y, u in zip([0.1, 1.2, None], [0.0, 1.0, 0.5])]     # the last is missing
+>>> state, infos = bootstrap(model, n=1000).run(observations, seed=0)
+>>> bool(abs(state.population.mean() - 1.67) < 0.05)                # 1.17 after y_1, and half a unit further
+True
 
-A model function with a parameter named ``t`` or ``u`` gets the time or the input by keyword. The first
-observation has t = 0. The transition to x_t is called with t >= 1. An observation without input needs no `WithInput`.
-
-`Component.at_step` returns the component for step t with input u.
+The first observation has t = 0. The transition to x_t is called with t >= 1, and the input of the first step belongs
+to no transition. An observation without input needs no `WithInput`. `Component.at_step` returns the component for
+step t with input u.
 """
 
 from __future__ import annotations

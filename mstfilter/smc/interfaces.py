@@ -15,8 +15,20 @@ generator as first argument. All methods work on whole populations, so a compone
 ...         step = self.scale * rng.standard_normal(population.particles.shape)
 ...         return Population(population.particles + step, population.log_weights)
 
+In the terms of theory, with weighted particles (x_i, w_i):
+
+=============  ==================================================================================================
+`Proposal`     x ~ q(x | y), new particles; also those of the first step, x_0 ~ p(x_0)
+`Transition`   x_t ~ f(x_t | x_{t-1}), or x_t ~ q(x_t | x_{t-1}, y_t) with w_i multiplied by f / q
+`Update`       w_i multiplied by p(y_t | x_i)
+`Resampler`    n particles such that the expected mean of w f(x) stays the same for every f
+`Trigger`      whether to resample, usually if (sum w)^2 / sum w^2 < n / 2
+`Lookahead`    the particles are selected by w_i a(x_i, y_t), and their weights then divided by a
+=============  ==================================================================================================
+
 Every filter needs a `Proposal` for its first particles, a `Resampler` and a `Trigger`. Most filters have a
-`Transition` and an `Update`. Models and programs use `Distribution` objects.
+`Transition` and an `Update`. Models and programs use `Distribution` objects. Reference: Chopin and Papaspiliopoulos
+(2020), "An introduction to sequential Monte Carlo", chapter 10.
 """
 
 from __future__ import annotations
@@ -124,8 +136,10 @@ class Update(Component):
         At least one of `predicted` and `proposed` is not None.
 
         `predicted` are the moved particles, None at the first step of a filter that starts from its proposal.
-        `proposed` are new particles; None if the filter has no proposal. Each particle of the result keeps the
-        ``parents`` of the particles from which it was made (see `union`).
+        `proposed` are new particles; None if the filter has no proposal. The log weights of `predicted` contain the
+        likelihoods of all earlier observations and those of `proposed` do not, so an update that keeps both must
+        bring them to one level, as `Reweight` does. Each particle of the result keeps the ``parents`` of the
+        particles from which it was made (see `union`).
         """
 
 

@@ -18,6 +18,7 @@ What matters for an estimate is also how the copies of different particles vary 
 unlucky order `Systematic` can be worse than `Multinomial`, though not for sorted ones (`Sorted`).
 
 >>> import numpy as np
+>>> from mstfilter.smc import Systematic
 >>> rng = np.random.default_rng(0)
 >>> Systematic().select(rng, np.log([0.5, 0.25, 0.25]), 4)[0]
 array([0, 0, 1, 2])

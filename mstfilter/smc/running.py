@@ -1,18 +1,25 @@
 """Runs of one or several filters with many seeds.
 
->>> runs = run_many(bootstrap(model, n=100), observations, seeds=range(200), ess=ess, log_evidence=log_evidence)
+A run is random, so a figure of one run says little: the error of a filter is that of its runs over seeds, and a
+difference between two filters is best seen seed by seed, because both have the same data and the same streams:
+
+>>> from mstfilter.smc import Multinomial, Normal, StateSpaceModel, bootstrap, ess, mean, run_many
+>>> model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 1.0))
+>>> states, observations = model.simulate(50, seed=1)
+>>> runs = run_many(bootstrap(model, n=100), observations, seeds=range(200), ess=ess)
 >>> runs["ess"].shape                                  # (seed, time)
 (200, 50)
->>> runs = run_many(
-...     {"systematic": bootstrap(model, 100), "multinomial": bootstrap(model, 100, Multinomial())},
-...     observations, seeds=range(20), workers=4)
->>> runs["log_evidence"].shape                         # (arm, seed, time)
+>>> arms = {"systematic": bootstrap(model, 100), "multinomial": bootstrap(model, 100, Multinomial())}
+>>> runs = run_many(arms, observations, seeds=range(20), mean=mean)
+>>> runs["mean"].shape                                 # (arm, seed, time)
 (2, 20, 50)
+>>> exact = bootstrap(model, n=100_000).run(observations)[0].population.mean()
+>>> errors = (runs["mean"][:, :, -1] - exact) ** 2     # paired by seed
 
 Runs of filters whose components process each particle alone, as those of all models do, are made in sweeps, as arrays
 (see `mstfilter.smc.sweep`): independent runs with the law of single ones. With ``together=False``, or if a component
 looks at several particles, run k equals ``filter.run(observations, seeds[k])`` bit for bit. Nothing depends on the
-number of workers. All filters get the same seeds and streams, so differences between filters have less noise.
+number of workers. `History.compare` tests the paired differences (`mstfilter.scoring.statistics`).
 """
 
 from __future__ import annotations

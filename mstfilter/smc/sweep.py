@@ -4,7 +4,8 @@ The functions of a model process each particle as if it were alone (`Component.a
 run a particle belongs to. Only weights, triggers and resampling are by run. 200 runs of 100 particles cost one call
 with 20,000 particles instead of 200 calls with 100: a thirtieth of the time.
 
->>> from mstfilter.smc import Normal, StateSpaceModel, bootstrap, log_evidence
+>>> from mstfilter.smc import Key, Normal, StateSpaceModel, bootstrap, log_evidence
+>>> from mstfilter.smc.sweep import sweep_runs
 >>> model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 1.0))
 >>> runs = sweep_runs(bootstrap(model, 100), [0.3, -0.2], [1, 2, 3, 4, 5], Key(0), {"log_evidence": log_evidence})
 >>> [run.rows["log_evidence"].shape for run in runs]

@@ -1,14 +1,28 @@
 """Resamplers that wrap another resampler (`scheme`).
 
-`Sorted` and `Shuffled` change the order of the particles, `Coalesced` merges equal particles, and `Tempered` and
-`KeepWeights` change the weights.
+What a scheme does depends on what it is given. `Sorted` puts similar particles side by side, so that a scheme that
+draws one particle per stretch of weight (`Stratified`) draws one per region of space; `Shuffled` destroys an unlucky
+order. `Coalesced` merges equal particles first, and so pays for each value once:
 
 >>> import numpy as np
->>> from mstfilter.smc import Coalesced, FearnheadClifford, Population
+>>> from mstfilter.smc import Coalesced, FearnheadClifford, Population, Sorted, Stratified
 >>> rng = np.random.default_rng(0)
 >>> doubled = Population(np.array([1.0, 2.0, 1.0, 3.0]), np.log([1.0, 1.0, 2.0, 4.0]))
 >>> Coalesced(FearnheadClifford()).resample(rng, doubled, 3).particles
 array([2., 1., 3.])
+
+Sorting takes most of the noise from the mean of particles on a line (Li, Wang, Deng, Liu 2022):
+
+>>> x = rng.standard_normal(200)
+>>> population = Population(x, -((x - 0.5) ** 2))
+>>> def noise(scheme):
+...     return np.std([scheme.resample(rng, population, 50).particles.mean() for _ in range(200)])
+>>> bool(noise(Sorted(Stratified())) < 0.2 * noise(Stratified()))
+True
+
+`Tempered` selects by w^a and multiplies the output weights by w^(1 - a), so light particles are kept more often.
+`Sized` lets a `Size` choose the number of particles. All of these are properly weighted if their scheme is;
+`KeepWeights` is not, because its weights count twice.
 """
 
 from __future__ import annotations

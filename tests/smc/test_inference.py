@@ -45,6 +45,7 @@ from mstfilter.smc import (
     pmmh,
     rao_blackwellised,
     sample,
+    smc2,
     switch,
 )
 from tests.smc.models import (
@@ -511,8 +512,42 @@ def test_first_parameters_are_draws_from_the_prior():
         lambda theta: filter_of(theta[:1]), YS, Product([*PRIOR.values()]), scale=[0.1, 0.1], n_iterations=2
     )
     assert vectors.theta.shape == (2, 1, 2) and not vectors.names
-    number = pmmh(filter_of, YS, stats.norm(0.4, 0.4), scale=0.1, n_iterations=2)
+    number = pmmh(lambda theta: filter_of([theta]), YS, stats.norm(0.4, 0.4), scale=0.1, n_iterations=2)
     assert number.theta.shape == (2, 1, 1)
+
+
+@pytest.mark.parametrize("batched", [False, True])
+@pytest.mark.parametrize(
+    "prior, scale, rho_of",
+    [
+        (Normal(0.4, 0.4), 0.1, lambda theta: theta),
+        (Product([*PRIOR.values()]), [0.1, 0.1], lambda theta: theta[0]),
+        (PRIOR, {"rho": 0.1, "tau": 0.1}, lambda theta: theta["rho"]),
+    ],
+    ids=["number", "vector", "names"],
+)
+def test_parameters_have_one_form_everywhere(prior, scale, rho_of, batched):
+    """`filter_of` gets the same kinds of parameters from `pmmh`, `ensemble` and `smc2`."""
+
+    def kind(theta):
+        if isinstance(theta, dict):
+            return tuple((name, kind(value)) for name, value in theta.items())
+        return "number" if isinstance(theta, float) else f"array of {theta.ndim} axes"
+
+    def kinds(run, **named):
+        seen = set()
+
+        def watched(theta):
+            seen.add(kind(theta))
+            return filter_of([rho_of(theta)], n=5)
+
+        run(watched, YS[:2], prior, batched=batched, **named)
+        return seen
+
+    found = kinds(smc2, n=10, steps=1)
+    assert len(found) == 1 + batched  # of one filter, and of all together
+    assert kinds(pmmh, scale=scale, n_chains=2, n_iterations=2) == found
+    assert kinds(ensemble, n_walkers=8, n_iterations=2) == found
 
 
 def test_named_priors_have_the_exact_posterior():

@@ -120,6 +120,21 @@ class Around(Proposal):
         return Population(self.mean + rng.normal(size=(n, 2)))
 
 
+@pytest.mark.parametrize("log_likelihood", [-5.0, 0.0, 5.0])
+def test_proposed_particles_weigh_as_much_as_predicted_ones(log_likelihood):
+    """If all explain the observations equally well, a third of the particles is new in each step of a long run."""
+    filter = ParticleFilter(
+        initial=Around(np.ones(2)),
+        proposal=Around(np.zeros(2)),
+        update=Reweight(lambda x, y: np.full(len(x), log_likelihood)),
+        n=10,
+        n_proposed=5,
+    )
+    for state, info in filter.iterate(range(30)):
+        new = (state.population.parents["proposed"] >= 0).sum()
+        assert new in (3, 4), f"{new} of 10 in step {info.t}"
+
+
 def test_proposals_may_have_arrays_as_fields():
     """A filter starts from its proposal if `initial` equals it; the comparison must not fail."""
     a, b = np.array([0.0, 1.0]), np.array([2.0, 1.0])

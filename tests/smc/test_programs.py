@@ -529,7 +529,8 @@ def test_every_filter_of_every_program_runs(path):
     module = runpy.run_path(str(path))
     if "filters" not in module:
         pytest.skip("is no program with filters()")
-    observations = module["simulate"](6)[-1]
+    model = module["model"]
+    observations = (model if isinstance(model, StateSpaceModel) else Program(model)).simulate(6)[1]
     for filter in module["filters"](30).values():
         state, _ = filter.run(observations, 0)
         assert np.isfinite(state.log_evidence)

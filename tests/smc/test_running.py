@@ -174,8 +174,8 @@ def test_a_run_goes_on_from_a_stored_state(filter, ys, codec, tmp_path):
     stored = filter.run(ys[:4], 5)[0]
     save_state(tmp_path / "run.npz", replace(stored, properly_weighted=False), codec)
     assert not load_state(tmp_path / "run.npz", codec).properly_weighted
-    save_state(tmp_path / "run.npz", stored, codec)
-    state = load_state(tmp_path / "run.npz", codec)
+    save_state(str(tmp_path / "run.npz"), stored, codec)
+    state = load_state(str(tmp_path / "run.npz"), codec)
     state, infos = filter.run(ys[state.t :], state)
     assert [info.t for info in infos] == list(range(4, len(ys)))
     assert (state.log_evidence, state.t, state.key) == (whole.log_evidence, len(ys), whole.key)

@@ -4,8 +4,23 @@ A filter of n particles draws a path x_0 .. x_T that has nearly the law p(x_0 ..
 order 1 / n. Conditional SMC removes the bias: one of the particles must follow a given path, and the drawn path
 replaces it. This is a Markov chain of paths whose law is exact for any n >= 2 (Andrieu, Doucet, Holenstein 2010):
 
->>> path = conditional_path(filter, observations, seed=0)                  # from an ordinary filter
->>> path = conditional_path(filter, observations, seed=1, path=path)       # the next one, given the first
+>>> import numpy as np
+>>> from mstfilter.smc import Normal, StateSpaceModel, bootstrap, conditional_path, path_log_prob
+>>> model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 1.0))
+>>> states, observations = model.simulate(20, seed=1)
+>>> filter = bootstrap(model, n=10)
+>>> paths = [conditional_path(filter, observations, seed=0)]               # from an ordinary filter
+>>> for seed in range(1, 50):
+...     paths.append(conditional_path(filter, observations, seed, paths[-1]))          # given the one before
+>>> np.array(paths).shape
+(50, 20)
+
+Since all particles stem from few ancestors, the early states of the path would hardly change. Ancestor sampling
+prevents this: the given path gets a new ancestor at each time, particle i with probability proportional to
+w_i f(x_t | x_i) (Lindsten, Jordan, Schön 2014). It needs the density f of the transition:
+
+>>> len({path[0] for path in paths}) > 10
+True
 
 `path_log_prob` is the joint log density of a path and the observations. Programs are supported too.
 """

@@ -13,7 +13,8 @@ Whiteley 2018).
 `energy_distance` compares two populations. Half of the energy distance between a population and the true state is
 the energy score (Gneiting and Raftery 2007). A lower score is better:
 
->>> energy_distance(population, Population(np.array([truth]))) / 2         # doctest: +SKIP
+>>> from mstfilter.smc import Population, energy_distance
+>>> score = energy_distance(found.state.population, Population(states[-1:])) / 2
 """
 
 from __future__ import annotations

@@ -5,6 +5,7 @@ q and accepts it with probability min(1, p(new) q(old | new) / (p(old) q(new | o
 one chain for each row, all chains take a step in one call:
 
 >>> import numpy as np
+>>> from mstfilter.smc.inference.metropolis import moved
 >>> def propose(rng, x):                                        # p is N(0, 1), q is symmetric
 ...     new = x + rng.standard_normal(x.shape)
 ...     return new, 0.5 * (x**2 - new**2)

@@ -5,15 +5,20 @@ without bias, and an unbiased estimate in place of the exact value leaves the po
 if the estimate of the present parameters is kept until a proposal is accepted (Andrieu, Doucet, Holenstein 2010). So
 a model with parameters is a function that returns a filter, and the prior is a distribution for each parameter:
 
+>>> from mstfilter.smc import Gamma, Normal, StateSpaceModel, Uniform, bootstrap, pmmh
+>>> def model_of(rho, sigma):
+...     return StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(rho * x, sigma), lambda x: Normal(x, 0.5))
 >>> def filter_of(theta):
-...     move = lambda x: Normal(theta["rho"] * x, theta["sigma"])
-...     return bootstrap(StateSpaceModel.of(Normal(0.0, 1.0), move, observation), n=200)
+...     return bootstrap(model_of(theta["rho"], theta["sigma"]), n=50)
+>>> states, observations = model_of(0.8, 0.5).simulate(20, seed=1)
 >>> prior = {"rho": Uniform(-1.0, 1.0), "sigma": Gamma(2.0, 0.5)}
->>> chains = pmmh(filter_of, observations, prior, scale={"rho": 0.1, "sigma": 0.1}, n_iterations=5000)
->>> chains["rho"][1000:].mean(), chains.autocorrelation_times()
+>>> chains = pmmh(filter_of, observations, prior, scale={"rho": 0.3, "sigma": 0.2}, n_iterations=50, n_chains=4)
+>>> chains["rho"].shape                                              # (iterations, chains)
+(50, 4)
+>>> mean, accepted = chains["rho"][20:].mean(), chains.accepted
 
-Without names, parameters are an array (d,): then the prior is a distribution of vectors, or a function that returns
-the log density, and `start` and `scale` are arrays.
+Without names, parameters are a number or an array (d,): then the prior is a distribution of these, or a function of
+arrays that returns the log density, and `start` and `scale` are arrays.
 
 - `pmmh` is such a Metropolis chain.
 - `ensemble` runs the ensemble sampler emcee with the same estimates. It needs no scale of the steps.
@@ -125,10 +130,12 @@ class _Parameters:
 
     def __init__(self, prior: Any, start: Any) -> None:
         self.names: tuple[str, ...] = ()
+        self.number = False  #: whether the only parameter is a number, as the prior draws it
         self.prior: Distribution | None = None
         if not callable(prior):
             self.prior = as_distribution(prior)
             self.names = tuple(self.prior.parts) if isinstance(self.prior, Joint) else ()
+            self.number = not self.names and self.prior.event_shape == ()
             prior = self.prior.log_prob
         if isinstance(start, Mapping) and self.prior is None:
             self.names = tuple(map(str, start))
@@ -142,8 +149,10 @@ class _Parameters:
         return found.item()
 
     def form(self, theta: np.ndarray) -> Any:
-        """What `filter_of` and the prior get: a mapping from names to entries of ``theta``, or the array itself."""
-        return dict(zip(self.names, theta, strict=True)) if self.names else theta
+        """What `filter_of` and the prior get: entries of ``theta`` by name, the only entry, or the array itself."""
+        if self.names:
+            return dict(zip(self.names, theta, strict=True))
+        return theta[0] if self.number else theta
 
     def start(self, given: Any, n: int | None, rng: np.random.Generator) -> np.ndarray:
         """(R, d) first parameters. Without any, `n` draws from the prior; None stands for 4 d."""
@@ -280,8 +289,9 @@ def pmmh(
     Parameters
     ----------
     filter_of : callable
-        ``(theta) -> ParticleFilter``. The components of the filter must be properly weighted. If the parameters have
-        names, ``theta`` is a mapping from names to numbers, otherwise an array (d,).
+        ``(theta) -> ParticleFilter``. The components of the filter must be properly weighted. ``theta`` is what the
+        prior draws, as in `smc2`: a mapping from names to numbers, an array (d,), or a number if the prior is a
+        distribution of numbers. It is an array (d,) if the prior is a function.
     prior : mapping, Distribution or callable
         A distribution for each name; a joint distribution, such as `Product`, `MultivariateNormal` or one of
         scipy.stats; or a function ``(theta) -> float``, the log density, -inf outside of the support.
@@ -291,7 +301,8 @@ def pmmh(
     scale : mapping, (d,) or (d, d) array_like
         Standard deviations or covariance of a step. A good choice is 2.4 / sqrt(d) posterior standard deviations.
     batched : bool
-        Whether ``filter_of`` also accepts parameters (d, m), or arrays (m,) by name, one for each of the m particles.
+        Whether ``filter_of`` also accepts arrays (m,) in place of numbers, or (d, m) in place of (d,): parameters for
+        each of the m particles.
         The filters of all chains then run as one batch. To combine a parameter with particles (n, k), use
         ``theta[0][..., None]``. If a component looks at several particles, the filters run one by one, with a
         warning.

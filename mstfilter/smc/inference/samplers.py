@@ -11,7 +11,7 @@ mean weight estimates the evidence, the integral of prior times likelihood (Del 
 >>> def log_likelihood(theta):
 ...     return Normal(theta[:, None], np.ones((1, 3))).log_prob(data)
 >>> found = tempering(Normal(0.0, 2.0), log_likelihood, n=1000)
->>> abs(found.mean - 1.169) < 0.1, abs(found.log_evidence + 4.548) < 0.2              # from the exact answers
+>>> bool(abs(found.mean - 1.169) < 0.1), abs(found.log_evidence + 4.548) < 0.2        # from the exact answers
 (True, True)
 >>> 0.02 < found.log_evidence_error < 0.1
 True

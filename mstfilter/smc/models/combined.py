@@ -1,9 +1,15 @@
 """Distributions made of others: mixtures, truncated ones, and products of independent ones.
 
+A mixture draws from one of its components, chosen by weight, and has the density sum_k w_k p_k(x). A truncated
+distribution is the base, given that the value lies between two bounds: p(x) / (F(high) - F(low)). A product is a
+vector of independent entries, whose log densities add up:
+
 >>> import numpy as np
 >>> from mstfilter.smc import Gamma, Mixture, Normal, Product, Truncated
 >>> heavy = Mixture([0.95, 0.05], [Normal(0.0, 1.0), Normal(0.0, 10.0)])        # one reading in twenty is an outlier
 >>> positive = Truncated(Normal(0.0, 1.0), low=0.0)
+>>> float(np.exp(positive.log_prob(0.5) - Normal(0.0, 1.0).log_prob(0.5)).round(6))       # half of the mass is left
+2.0
 >>> vectors = Product([Normal(0.0, 1.0), Gamma(2.0, 0.5)])                      # of two independent entries
 >>> vectors.sample(np.random.default_rng(0), 3).shape, round(float(vectors.log_prob([0.5, 1.0])), 3)
 ((3, 2), -1.658)

@@ -4,6 +4,7 @@ A model says how x_t and y_t are distributed given a particle. A filter has many
 row of parameters for each of them, and draws or evaluates all rows in one call:
 
 >>> import numpy as np
+>>> from mstfilter.smc import Normal
 >>> rng = np.random.default_rng(0)
 >>> x = Normal(np.zeros(5), 2.0).sample(rng, 5)          # x_0, one row per particle
 >>> Normal(x, 1.0).log_prob(0.3).shape                   # log p(y | x) of one observation for each particle

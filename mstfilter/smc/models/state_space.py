@@ -3,6 +3,7 @@
 The state is a Markov chain, x_0 ~ p(x_0) and x_t ~ f(x_t | x_{t-1}), and each observation depends on the present
 state, y_t ~ p(y_t | x_t). Three distributions are a model:
 
+>>> from mstfilter.smc import Normal, RandomWalkMove, StateSpaceModel, auxiliary, bootstrap, guided, resample_move
 >>> model = StateSpaceModel.of(
 ...     initial=Normal(0.0, 1.0),
 ...     transition=lambda x: Normal(0.9 * x, 0.5),
@@ -12,12 +13,21 @@ state, y_t ~ p(y_t | x_t). Three distributions are a model:
 >>> state, infos = bootstrap(model, n=1000).run(observations, seed=0)           # Gordon, Salmond, Smith 1993
 
 The bootstrap filter moves particles by f, and so without regard to y_t. If the likelihood is narrow, few of them
-land where it is large. A guided filter draws them from a proposal q(x_t | x_{t-1}, y_t) and corrects the weights by
-f / q. An auxiliary filter selects the particles with an eye on y_t before it moves them:
+land where it is large. A guided filter draws them from a proposal q(x_t | x_{t-1}, y_t) and multiplies the weights by
+f / q. An auxiliary filter selects the particles with an eye on y_t before it moves them, by weight times a priority
+near p(y_t | x_{t-1}). A resample-move filter makes copies of a particle differ again by a Markov kernel:
 
->>> guided(model, lambda x, y: Normal(0.5 * (0.9 * x + y), 0.4), n=100)         # Doucet, Godsill, Andrieu 2000
->>> auxiliary(model, log_priority, n=100)                                       # Pitt and Shephard 1999
->>> resample_move(model, RandomWalkMove(model, 0.5), n=100)                     # Gilks and Berzuini 2001
+>>> def proposal(x, y):                                                         # the product of two Gaussians
+...     return Normal(0.9 * x + 0.2 * (y - 0.9 * x), 0.2**0.5)
+>>> def log_priority(x, y):
+...     return Normal(0.9 * x, 1.25**0.5).log_prob(y)
+>>> filters = [
+...     guided(model, proposal, n=100),                                         # Doucet, Godsill, Andrieu 2000
+...     auxiliary(model, log_priority, n=100, proposal=proposal),               # Pitt and Shephard 1999
+...     resample_move(model, RandomWalkMove(model, 0.5), n=100),                # Gilks and Berzuini 2001
+... ]
+>>> all(abs(f.run(observations, seed=0)[0].log_evidence - state.log_evidence) < 2 for f in filters)
+True
 
 Each filter is a `ParticleFilter`, so any component can be replaced: ``replace(bootstrap(model, 100),
 resampler=...)``. The first observation updates the initial state before any prediction. Reference: Chopin and

@@ -4,12 +4,23 @@ A contract is a test class for pytest. The contract defines the arguments of cal
 (`call`), and the requirements of every result (`check_result`). Each further ``test_`` method checks one property.
 The first line of the docstring of a test states the property, and the message of a failure states the violation:
 
+>>> from mstfilter.smc import EssBelow
+>>> from mstfilter.smc.testing import Contract, check_properties
 >>> class TriggerContract(Contract):
 ...     returns = bool
 ...     def call(self, component, rng, inputs):
 ...         return component.wants(inputs["population"], 0)
+...     def test_even_weights_are_kept(self):
+...         '''Particles of equal weight are not resampled.'''
+...         population = self.inputs(6)["population"]
+...         even = population.take([0] * 6)
+...         assert not self.make().wants(even, 0), "it resamples equal weights"
+>>> results = check_properties(EssBelow(0.5), TriggerContract)
+>>> results[-1].statement, results[-1].failure
+('Particles of equal weight are not resampled.', None)
 
-This module does not import pytest, because pytest accepts `unittest.SkipTest`.
+General tests, which every contract inherits, are those of repeatability, of inputs that stay as they are, and of
+generators of the component's own. This module does not import pytest, because pytest accepts `unittest.SkipTest`.
 """
 
 from __future__ import annotations

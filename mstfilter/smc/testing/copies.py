@@ -1,8 +1,22 @@
 """Tests of the weights of particles after a resampling: test cases, statistics, and error messages.
 
+If n of m particles are selected without bias, the copies of particle i carry the share W_i of the weight on average.
 A `Case` is a list of weights and a number of particles to select. A `Sample` collects, over many resamplings, the
-share of the weight that the copies of each particle and of each group have. `fault_message` compares the mean with
-the expected weight.
+share that the copies of each particle and of each group of particles have, and bets against the expected share: for
+an unbiased scheme the stakes multiply to a large number with small probability only (Waudby-Smith and Ramdas 2024).
+
+>>> import numpy as np
+>>> from mstfilter.smc import Systematic
+>>> from mstfilter.smc.testing.copies import Case, Sample
+>>> case = Case((0.7, 0.2, 0.1), n=5)
+>>> rng, fair, greedy = np.random.default_rng(0), Sample(case), Sample(case)
+>>> for _ in range(500):
+...     fair.add(Systematic().select(rng, np.log(case.weights), 5)[0], np.ones(5))
+...     greedy.add(np.array([0, 0, 0, 0, 1]), np.ones(5))                    # never the last one
+>>> fair.evidence().max() < np.log(2e6), greedy.evidence().max() > np.log(2e6)
+(np.True_, np.True_)
+
+`fault_message` says how the mean weight differs from the expected one.
 """
 
 from __future__ import annotations

@@ -1,4 +1,26 @@
-"""Compares weighted particles with exact draws: distributions, mean weights, and independence."""
+"""Compares weighted particles with exact draws: distributions, mean weights, and independence.
+
+The author of a component often knows the answer for one case: draws of x_t given x_{t-1} and y_t, say. A contract
+then draws many particles through the component, and compares the weighted distribution functions at several quantiles
+with those of the exact draws. It also compares mean weights, since the evidence depends on them, and asks whether
+particles are independent. For this, the test class has a method `exact`:
+
+>>> import numpy as np
+>>> from mstfilter.smc import Dynamics, Normal, Population, StateSpaceModel
+>>> from mstfilter.smc.testing import TransitionContract, check_properties
+>>> model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 1.0))
+>>> class Moves(TransitionContract):
+...     n_draws = 20_000
+...     scale = 0.5
+...     def exact(self, rng, n):
+...         x = rng.standard_normal(n)
+...         return Population(x), Population(0.9 * x + self.scale * rng.standard_normal(n)), None
+>>> class Wrong(Moves):
+...     scale = 0.6
+>>> [any(r.name == "distribution_is_exact" and r.failure for r in check_properties(Dynamics(model), contract))
+...  for contract in (Moves, Wrong)]
+[False, True]
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,11 @@
 """The contract of models: state-space models, programs, and filters made of them.
 
+A model is used as if each particle were alone, and as if its densities were those of its draws. The contract asks for
+both: particles must get the same moves and weights in other company, and draws must have the density that the model
+states, for its transition, its initial distribution and its observations.
+
 >>> from mstfilter.smc import Normal, StateSpaceModel
+>>> from mstfilter.smc.testing import ModelContract, check_properties
 >>> model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 1.0))
 >>> all(result.failure is None for result in check_properties(model, ModelContract))
 True

@@ -1,7 +1,27 @@
 """Contracts of resamplers.
 
-A particle of normalised weight W_i must get n W_i copies on average if the resampler is properly weighted. If output
-weights differ, the copies must have the total weight W_i on average. `mstfilter.smc.testing.copies` has the cases.
+A resampler is properly weighted if the expected mean of w f(x) over the selected particles is that over all of them,
+for every f. So a particle of normalised weight W_i must get n W_i copies on average. If output weights differ, the
+copies must have the total weight W_i on average. The contract resamples small populations many times, among them ones
+with ties, zeros and one heavy weight (`mstfilter.smc.testing.copies`):
+
+>>> import numpy as np
+>>> from dataclasses import dataclass
+>>> from mstfilter.smc import WeightResampler
+>>> from mstfilter.smc.testing import WeightResamplerContract, check_properties
+>>> @dataclass(frozen=True)
+... class Rounded(WeightResampler):
+...     # n W_i copies, rounded down; the heaviest particle gets the rest
+...     def select(self, rng, log_weights, n):
+...         W = np.exp(log_weights - log_weights.max())
+...         copies = np.floor(n * W / W.sum()).astype(int)
+...         copies[W.argmax()] += n - copies.sum()
+...         return np.repeat(np.arange(len(W)), copies), None
+>>> results = check_properties(Rounded(), WeightResamplerContract)
+>>> next(result.failure for result in results if result.name == "carried_weight")     # it favours one of them
+'...copies are biased: particle ...'
+
+A scheme that declares itself not properly weighted, as `LargestWeights` does, may be biased.
 """
 
 from __future__ import annotations

@@ -1,4 +1,22 @@
-"""Contracts of what moves particles: transitions and rejuvenations."""
+"""Contracts of what moves particles: transitions and rejuvenations.
+
+A transition moves each particle as if it were alone, in any order, with weights that do not depend on the others. One
+with a density must move by it. A rejuvenation must leave p(x_t | x_{t-1}, y_t) invariant. Comparisons with exact
+draws need a method `exact` (`mstfilter.smc.testing.exact`).
+
+>>> from dataclasses import dataclass
+>>> import numpy as np
+>>> from mstfilter.smc import Population, Transition
+>>> from mstfilter.smc.testing import TransitionContract, check_properties
+>>> @dataclass(frozen=True)
+... class Shrink(Transition):
+...     def predict(self, rng, population, observation):
+...         x = population.particles
+...         moved = x - 0.1 * (x - x.mean()) + 0.1 * rng.standard_normal(x.shape)     # the mean of the others
+...         return Population(moved, population.log_weights, population.parents)
+>>> {result.name for result in check_properties(Shrink(), TransitionContract) if result.failure}
+{'moves_do_not_depend_on_others'}
+"""
 
 from __future__ import annotations
 

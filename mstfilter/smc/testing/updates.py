@@ -1,4 +1,15 @@
-"""Contracts of what makes and weighs particles: proposals and updates."""
+"""Contracts of what makes and weighs particles: proposals and updates.
+
+An update multiplies the weight of each predicted particle by a factor that depends on this particle and the
+observation, p(y_t | x_t) in a bootstrap filter. A proposal draws as many particles as it is asked for, independently.
+Comparisons with exact draws need a method `exact` (`mstfilter.smc.testing.exact`).
+
+>>> from mstfilter.smc import Reweight
+>>> from mstfilter.smc.testing import UpdateContract, check_properties
+>>> update = Reweight(lambda x, y: -0.5 * (x - x.mean() - y) ** 2)                    # x.mean() mixes particles
+>>> [result.name for result in check_properties(update, UpdateContract) if result.failure]
+['weight_of_a_particle_does_not_depend_on_others']
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,18 @@
-"""Contracts of triggers, sizes, lookaheads, similarities, equivalences and codecs."""
+"""Contracts of triggers, sizes, lookaheads, similarities, equivalences and codecs.
+
+These components return values, not particles. What they say about a population, a particle or a pair of particles
+must not depend on the order of the particles, on the scale of the weights, or on copies:
+
+>>> from dataclasses import dataclass
+>>> from mstfilter.smc import Trigger
+>>> from mstfilter.smc.testing import TriggerContract, check_properties
+>>> @dataclass(frozen=True)
+... class Heavy(Trigger):
+...     def wants(self, population, t):
+...         return bool(population.log_weights.max() > 0.0)                           # of unnormalised weights
+>>> [result.name for result in check_properties(Heavy(), TriggerContract) if result.failure]
+['scale_of_weights_is_irrelevant']
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,17 @@
 """Examines whether a program treats particles independently and draws random numbers only by `sample`.
 
-By mistake a program may mix particles (``x.mean()``, ``previous["x"][0]``), draw from another generator, or keep
-values between steps. The filter records the calls that the program made in a step, and then runs it once more:
+A program sees arrays of all particles. By mistake it may mix them (``x.mean()``, ``previous["x"][0]``), draw from
+another generator, or keep values between steps. Nothing looks odd then, but it is another model:
+
+>>> from mstfilter.smc import Normal, Program, observe, sample
+>>> def model(previous, y):
+...     x = sample("x", Normal(0.0, 1.0) if previous is None else Normal(previous["x"].mean(), 0.5))
+...     observe("y", Normal(x, 1.0), y)
+>>> Program(model).bootstrap(100).run([0.3, 0.1])
+Traceback (most recent call last):
+mstfilter.base.errors.InputError: step 1, transition: site 'x': particle ... alone ...
+
+The filter records the calls that the program made in a step, and then runs it once more:
 
 1. On a few of the particles alone, with the values that they have drawn. Distributions and returned values of a
    particle must not change. So an event axis that is used as the particle axis is found, too.

@@ -1,6 +1,23 @@
 """Handlers determine the values of the sites of a program. A site is a call of `sample`.
 
-A handler draws a value, replays the draw of a guide, or takes a given value.
+A program says which distributions its values have, but not where the values come from. The same program can therefore
+simulate, filter, and weigh given values, if something else answers its calls (the effect handlers of Pyro and Gen):
+
+`SampleHandler`    draws each value from the model
+`SimulateHandler`  draws observed values too
+`GuideHandler`     draws values for a guide and notes their densities
+`ReplayHandler`    hands the draws of the guide to the model, and weighs them by the ratio of the densities
+`GivenHandler`     takes values from somewhere else, such as a path, and weighs them by their density
+
+>>> import numpy as np
+>>> from mstfilter.smc import Normal, sample
+>>> from mstfilter.smc.models.programs.filters import run_program
+>>> from mstfilter.smc.models.programs.handlers import GivenHandler
+>>> def model(previous, y):
+...     sample("x", Normal(0.0, 1.0))
+>>> particles, log_density = run_program(model, GivenHandler({"x": np.array([0.0, 1.0])}), None, None, 2)
+>>> log_density.round(3)
+array([-0.919, -1.419])
 """
 
 from __future__ import annotations

@@ -1,4 +1,25 @@
-"""The functions that a program calls (`sample`, `observe`, `switch`), and `ProgramRun`, one run of a program."""
+"""The functions that a program calls (`sample`, `observe`, `switch`), and `ProgramRun`, one run of a program.
+
+A program runs once per step for all particles, so a site has one value per particle: an array (n, ...). `switch` is
+an
+``if`` for arrays. It draws a branch for each particle, and runs each branch on the rows of its particles:
+
+>>> from mstfilter.smc import Normal, Program, observe, sample, switch
+>>> def model(previous, y):
+...     def near(x):
+...         return sample("x", Normal(0.0 if x is None else x, 0.1))
+...     def far(x):
+...         return sample("x", Normal(0.0 if x is None else x, 3.0))
+...     x = switch("jump", [0.9, 0.1], [near, far], None if previous is None else previous["x"])
+...     observe("y", Normal(x, 0.2), y)
+>>> state, infos = Program(model).bootstrap(300).run([0.1, 4.0], seed=0)
+>>> round(float(state.population.mean()["jump"]), 6)                # only a jump explains the second observation
+1.0
+
+`ProgramRun` stores the values by name, adds up the log densities of what is observed, and checks that no particle
+reaches two sites of one name. Where the values come from is for a handler to say
+(`mstfilter.smc.models.programs.handlers`).
+"""
 
 from __future__ import annotations
 
