@@ -10,7 +10,8 @@ few weighted hypotheses, each of which says which object every voxel belongs to:
 >>> belief.estimate().volumes()                                    # the best single answer
 >>> belief.same_object_at_pixels(recording.frames[-1].camera, (310, 200), (340, 210))    # a probability
 
-The package has nine rooms, and each imports only from those below it:
+The package has nine rooms, and each imports only from those below it. (A few methods, such as ``plot``, look up their
+code in a higher room when they are called.)
 
 ===========  =========================================================================================
 `app`        what people start: the command line, reports

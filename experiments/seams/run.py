@@ -2,7 +2,7 @@
 
     python experiments/seams/run.py samples FOLDER        # training samples of the labelled real images
     python experiments/seams/run.py score --out FOLDER [--judge MODEL] [--fold hots=MODEL,osd=MODEL]
-        [--shares .5,.9] [--scenes s1,s2,s3] [--seeds 0-9] [--no-real]
+        [--priors .85:3.5,.5:1000] [--scenes s1,s2,s3] [--seeds 0-9] [--no-real]
     python experiments/seams/run.py score --smoke --out FOLDER
 
 Both need the data in MSTFILTER_SHARED (default ../shared) under real/; `score` works without.
@@ -16,7 +16,7 @@ fitted to frames of that camera set-up (the border model, for OSD: of that group
 - `split`: of true objects, the mean share of draws in which a second segment has a tenth of their pixels.
 - `log_loss`: of the question whether two pixels of objects show one, as in ../real/scores.py.
 
-scores.csv has a row for each image, tree and share; summary.csv the means by family or data set.
+scores.csv has a row for each image, tree and prior; summary.csv the means by family or data set.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ def scored(image: Labelled, proposal: TreeCutProposal) -> dict[str, float]:
 def main(options: argparse.Namespace) -> None:
     """Score the trees and write the tables."""
     folds = dict(part.split("=") for part in options.fold.split(",")) if options.fold else {}
-    shares = [float(share) for share in options.shares.split(",")]
+    priors = [tuple(float(n) for n in prior.split(":")) for prior in options.priors.split(",")]
     first, last = (int(n) for n in (options.seeds.split("-") * 2)[:2])
     rows: Rows = []
     simulated = simulated_images([n for n in options.scenes.split(",") if n], range(first, last + 1))
@@ -150,13 +150,16 @@ def main(options: argparse.Namespace) -> None:
     for source, image in images:
         base = BorderTree(weights=border_model(image.name) if source else "border")
         judge = folds.get(source, options.judge)
-        trees: list[tuple[str, float, BorderTree | SeamTree]] = [] if options.no_base else [("border", np.nan, base)]
+        trees: list[tuple[str, str, BorderTree | SeamTree]] = [] if options.no_base else [("border", "", base)]
         if judge:
-            trees += [("seams", share, SeamTree(base=base, weights=judge, one_share=share)) for share in shares]
-        for name, share, tree in trees:
+            trees += [
+                ("seams", f"{share}:{size}", SeamTree(base=base, weights=judge, one_share=share, prior_size=size))
+                for share, size in priors
+            ]
+        for name, prior, tree in trees:
             found = scored(image, TreeCutProposal(tree=tree, objects=ObjectRule()))
             rounded = {key: round(value, 4) for key, value in found.items()}
-            rows.append({"group": image.group, "image": image.name, "tree": name, "one_share": share} | rounded)
+            rows.append({"group": image.group, "image": image.name, "tree": name, "prior": prior} | rounded)
         scene_cache.clear()
     options.out.mkdir(parents=True, exist_ok=True)
     write_csv(options.out / "scores.csv", rows)
@@ -178,21 +181,19 @@ def summaries(rows: Rows) -> Rows:
     found: Rows = []
     numbers = list(rows[0])[4:]
     keys = dict.fromkeys(
-        (row["group"], name, row["tree"], row["one_share"]) for row in rows for name in ("all", row["image"])
+        (row["group"], name, row["tree"], row["prior"]) for row in rows for name in ("all", row["image"])
     )
-    for group, name, tree, share in keys:
+    for group, name, tree, prior in keys:
         own = [
             row
             for row in rows
-            if (row["group"], row["tree"], str(row["one_share"])) == (group, tree, str(share))
-            and name in ("all", row["image"])
+            if (row["group"], row["tree"], row["prior"]) == (group, tree, prior) and name in ("all", row["image"])
         ]
         if name == "all" or len(own) > 1:
             means = {n: round(float(np.nanmean([row[n] for row in own])), 4) for n in numbers}  # type: ignore[list-item]
-            found.append(
-                {"group": group, "image": name, "tree": tree, "one_share": share, "images": len(own)} | means
-            )
-    return list({str(list(row.values())[:4]): row for row in found}.values())
+            about = {"group": group, "image": name, "tree": tree, "prior": prior, "images": len(own)}
+            found.append(about | means)
+    return found
 
 
 if __name__ == "__main__":
@@ -204,7 +205,7 @@ if __name__ == "__main__":
     score.add_argument("--out", type=Path, required=True)
     score.add_argument("--judge", default="", help="model of the judge for simulated images; default: no judge")
     score.add_argument("--fold", default="", help="hots=MODEL,osd=MODEL: judges that have not seen these frames")
-    score.add_argument("--shares", default="0.5", help="prior probabilities of one object")
+    score.add_argument("--priors", default="0.85:3.5", help="one_share:prior_size, separated by commas")
     score.add_argument("--scenes", default="s1,s2,s3")
     score.add_argument("--seeds", default="0-9")
     score.add_argument("--no-real", action="store_true")

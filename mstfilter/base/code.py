@@ -1,4 +1,6 @@
-"""What code does, without how it is written: results are known to be of the same program by its hash.
+"""Hashes of Python code, by which results are known to be of the same program.
+
+Comments, docstrings, layout and the version number leave them as they are, because results do not depend on these:
 
 >>> code_of(b"x = 1  # one") == code_of(b"x  =  1")
 True
@@ -19,7 +21,7 @@ _Documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
 def code_of(source: bytes) -> bytes:
     """The syntax tree of Python code without docstrings and version number; of other text, the text itself.
 
-    Comments, docstrings, the format and the number of a release do not change what a program does.
+    Comments and layout are not part of a syntax tree.
     """
     try:
         tree = ast.parse(source)

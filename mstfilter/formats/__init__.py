@@ -8,14 +8,15 @@
 A reader is a `RecordingFormat`, a frozen dataclass with ``detects(path)`` and ``open(path)``. To read another layout,
 write one more of them. A long video is divided into clips at its pauses, which a `PauseRule` finds.
 
-===============  ======================================================================================
-`sources`        `open_recording`: finds out the format of a path and opens it
-`folder`         the recording folder of mstfilter: reader and writer
-`image_folders`  folders of colour and depth images: pairs, TUM, Redwood and Open3D
-`bag`            ROS 1 and ROS 2 bags, MCAP
-`video`          what all readers of videos share
-`pauses`         rules that find the pauses
-===============  ======================================================================================
+=========================  ============================================================================
+`sources`                  `open_recording`: finds out the format of a path and opens it
+`folder`                   the recording folder of mstfilter: reader and writer
+`pairs`, `tum`, `redwood`  folders of images: pairs of colour and depth, TUM RGB-D, Redwood and Open3D
+`bag`                      ROS 1 and ROS 2 bags, MCAP
+`video`, `image_folders`   what all readers of videos share; what those of image folders share
+`images`, `ros_images`     decoding of image files, and of images in ROS messages
+`pauses`                   rules that find the pauses
+=========================  ============================================================================
 """
 
 from mstfilter.base.lazy import attach

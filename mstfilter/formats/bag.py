@@ -183,8 +183,8 @@ class _Stream:
 class Bag(VideoFormat):
     """Reader of ROS 1 bags, ROS 2 bags and MCAP: image, compressed image, depth and CameraInfo topics.
 
-    Further parameters: `VideoFormat`. The parameter `K` replaces the camera matrix of the CameraInfo messages, and
-    `distortion` their distortion.
+    The method `open` and further parameters are those of `VideoFormat`. The parameter `K` replaces the camera matrix
+    of the CameraInfo messages, and `distortion` their distortion.
 
     Parameters
     ----------

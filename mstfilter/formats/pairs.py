@@ -1,4 +1,4 @@
-"""Folders of pairs of images, NAME_rgb.png and NAME_depth.png, with one info.json.
+"""Folders of pairs of a colour and a depth image, NAME_rgb.png and NAME_depth.png, with one info.json.
 
 >>> PairedImages(frames=("learn2", "learn3", "learn4")).open(Path("frames"))
 """

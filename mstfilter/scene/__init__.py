@@ -15,11 +15,12 @@ z of the world points up, and the table is at z = 0. This room depends neither o
 
 =====================================  ===============================================================
 `camera`, `frame`, `recording`         pinhole cameras; images, clips; videos with pauses
+`from_arrays`, `pauses`                what `Recording.from_arrays` checks; the interface of rules that find pauses
 `voxels`, `occupancy`, `partitions`    grids and hypotheses; probabilities; renumbered and refined labels
 `planes`, `heights`, `support`         the table and walls; readings above it; which pixels belong to objects
 `geometry`                             voxels in the image, the workspace
 `rendering`, `outlines`, `evidence`    hypotheses seen by a camera, with the outlines of an image; free space, scores
-`plausibility`                         faults of the input, found before a run
+`plausibility`, `alignment`            faults of the input, found before a run; its measurements in several frames
 `encoding`, `arrays`                   hypotheses as arrays; content keys
 `cache`                                results that depend on the images alone, computed once
 =====================================  ===============================================================

@@ -1,4 +1,4 @@
-"""Evidence about hypotheses in one frame: observed free space, and scores.
+"""What one frame says about hypotheses: observed free space, and terms of a score.
 
 >>> refined, quality = FreeSpace().project(hypothesis, frame)           # one hypothesis, one frame
 >>> refined, quality = FreeSpace().refine(hypotheses, clip)             # several, at the end of a clip
@@ -193,7 +193,9 @@ def _interior(rendered: Rendering, size: float) -> np.ndarray:
 
 
 class Evidence(Checked, ABC):
-    """A term in the score of candidate hypotheses.
+    """A term in the score of candidate hypotheses, for the field `evidence` of an update.
+
+    (The *log evidence* of a filter is something else: the log probability density of all observations.)
 
     The docstring of each term lists the data that it uses, so that you see whether terms share data.
     """

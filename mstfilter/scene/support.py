@@ -4,14 +4,15 @@
 >>> found.pixels                        # (H, W) bool, may belong to an object
 >>> found.frame.depth                   # metres, estimated where a pixel of an object has no reading of it
 
-Pixels with a depth reading are classified by depth (`mstfilter.scene.heights`). Isolated readings above the table are
-noise, and so are low readings with the colour of the table: cloth, glare, and the depth that sensors smear from an
-object into the table. Walls and things beside the table are no objects. Other connected regions of readings are
-objects. Dark or shiny surfaces
-often have no readings. A pixel without a reading belongs to an object if its colour differs from the nearby table.
-Near the outline of an object, depth images have errors of several pixels. There, the colours of the object and of the
-table decide. A region of another colour with readings on the table is a flat object if it is higher than the table
-around it.
+Pixels with a depth reading are classified by depth (`mstfilter.scene.heights`): connected regions of readings above
+the table are objects. Isolated ones are noise, and so are low ones with the colour of the table, which come from
+cloth, from glare, and from the depth that sensors smear from an object into the table. Walls and things beside the
+table are no objects either.
+
+Where depth fails, colour decides. Dark or shiny surfaces often have no readings, so a pixel without one belongs to an
+object if its colour differs from the nearby table. Near the outline of an object, depth images have errors of several
+pixels, so there the colours of the object and of the table decide. A region of another colour with readings on the
+table is a flat object if it is higher than the table around it.
 """
 
 from __future__ import annotations

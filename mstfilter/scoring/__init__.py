@@ -15,6 +15,7 @@ the probabilities are that its weighted set gives.
 `questions`   "do these two voxels belong to one object?", fixed by the recording
 `log_loss`    the log loss of the answers, recalibrated on other scenes
 `forecasts`   Brier score, calibration and recalibration of any forecasts
+`own`         metrics of your own, for studies
 `pauses`      all pauses of a recording
 `statistics`  paired differences: intervals, p values, conclusions
 ============  =========================================================================================

@@ -1,4 +1,4 @@
-"""Scores of forecasts: Brier score, log loss, calibration, recalibration.
+"""Forecasts of any event: Brier score, log loss, calibration, recalibration.
 
 A forecast of an event is a probability p, and its outcome y is 0 or 1. Many forecasts are stored as a table, which
 has the numbers of outcomes 0 and 1 for each value of p. Tables can be pooled.

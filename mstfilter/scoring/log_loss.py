@@ -1,4 +1,4 @@
-"""Scores of forecasts: the answers of a weighted set of hypotheses to `questions`.
+"""Scores of a weighted set of hypotheses, from the probabilities with which it answers the `questions`.
 
 >>> belief = score_belief(ask(recording, t), hypotheses, weights, recording.truth(t))
 >>> belief.row["brier"], belief.row["log_loss"]                # as the hypotheses come

@@ -5,19 +5,30 @@
 
 Unless stated otherwise, a metric is the unweighted mean over the hypotheses, and sizes are volumes.
 
-``quality``: weighted coverage in the form ``objects``. Missed, invented, split and merged objects reduce the quality.
-``quality_paper``, ``quality_authors``: the other forms (see `scoring.quality`). ``quality_top``,
-``quality_weighted``, ``quality_best``: quality of the hypothesis of largest weight, weighted mean, and maximum. If
-several have the largest weight, ``quality_top`` is of the first of them, a random draw. Maxima are comparable only
-for equal numbers of hypotheses. ``quality_estimate``: quality of the hypothesis of least expected loss
-(`least_loss`), the best single answer. ``quality_visible``, ``quality_hidden``, ``quality_unseen``: coverage of the
-true objects that are visible at this pause, that were visible only at earlier pauses, and that never were visible
-(`mstfilter.scoring.object_status`). ``quality_one_blob``, ``quality_components``: trivial baselines, with the
-occupied voxels as one object or as their connected components. ``occupancy``: intersection over union of the occupied
-voxels. ``volume_missed``, ``volume_invented``: volume that is occupied only in the truth, and only in the hypothesis,
-divided by the true volume; NaN if it is 0. ``object_f``: F score of objects at IoU 0.5. ``split``, ``merged``,
-``missed``, ``invented``: numbers of objects (see `object_metrics`). ``diversity``: 1 - mean quality over pairs of
-hypotheses, which is 0 if all hypotheses are identical.
+=============================================  =======================================================================
+``quality``                                    weighted coverage in the form ``objects``: missed, invented, split and
+                                               merged objects reduce it
+``quality_paper``, ``quality_authors``         the other forms (`mstfilter.scoring.quality`)
+``quality_weighted``, ``quality_best``         mean by weight; maximum, comparable only for equal numbers of
+                                               hypotheses
+``quality_top``                                of the hypothesis of largest weight; if several have it, of the first,
+                                               a random draw
+``quality_estimate``                           of the hypothesis of least expected loss (`least_loss`), the best
+                                               single answer
+``quality_visible``, ``n_visible``             coverage and number of the true objects that are visible at this pause
+``quality_hidden``, ``n_hidden``               of those that were visible only at earlier pauses
+``quality_unseen``, ``n_unseen``               of those that never were visible (`mstfilter.scoring.object_status`)
+``quality_one_blob``, ``quality_components``   trivial baselines: the occupied voxels as one object, or as their
+                                               connected components
+``occupancy``                                  intersection over union of the occupied voxels
+``volume_missed``, ``volume_invented``         volume that is occupied only in the truth, only in the hypothesis,
+                                               divided by the true volume; NaN if it is 0
+``object_f``                                   F score of objects at IoU 0.5
+``split``, ``merged``                          numbers of objects (`object_metrics`)
+``missed``, ``invented``                       numbers of objects without a partner (`object_metrics`)
+``true_objects``                               number of true objects
+``diversity``                                  1 - mean quality over pairs of hypotheses, 0 if all are identical
+=============================================  =======================================================================
 """
 
 from __future__ import annotations

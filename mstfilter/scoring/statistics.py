@@ -87,6 +87,9 @@ Values = Mapping[Any, float] | Sequence[float] | np.ndarray
 def compare(first: Values, second: Values) -> Difference:
     """The paired difference `first` minus `second`, over the units that have values in both.
 
+    Studies call it for each family, arm and metric, and adjust the p values themselves
+    (`mstfilter.runs.study.summary`).
+
     Parameters
     ----------
     first, second : mapping, or (n,) array_like
@@ -176,21 +179,23 @@ plot_differences = late("mstfilter.app.report.charts:draw_differences", "Differe
 
 
 def compare_arms(table: Mapping[str, Values], reference: str, unit: str = "unit") -> Differences:
-    """Differences of every compared method from the reference, with p values adjusted for all comparisons.
+    """Differences of every arm from the reference, with p values adjusted for all comparisons of this one table.
+
+    `compare_runs` calls it. Studies do not, because they adjust over families and metrics too: they use `compare`.
 
     Parameters
     ----------
     table : mapping
-        Name of a compared method -> values, as for `compare`.
+        Name of an arm -> values, as for `compare`.
     reference : str
-        The method with which the other methods are compared.
+        The arm with which the others are compared.
     unit : str
         The word for a paired unit, for the conclusions.
 
     Returns
     -------
     Differences
-        Mapping from names of methods, without the reference, to `Difference`.
+        Mapping from names of arms, without the reference, to `Difference`.
     """
     if reference not in table:
         raise InputError(f"there is no arm {reference!r}", f"there are: {', '.join(table) or 'no arms'}")

@@ -16,7 +16,8 @@ Among all unbiased schemes without duplicates, this one has the least expected s
 and Clifford 2003). `Chopthin` duplicates too, but bounds the ratio of two output weights (Gandy and Lau 2016). Both
 need only the weights. `ClusterStratified` compares particles by a `Similarity`: it forms groups of similar particles,
 and divides the n particles to select among the groups by weight, at least one per group if possible. A light group
-thus keeps a particle, while schemes that use only weights usually drop it:
+thus keeps a particle, while schemes that use only weights usually drop it. It is unbiased if the scheme with which it
+selects inside the groups is (its field `scheme`, by default `Systematic`):
 
 >>> chosen = ClusterStratified(Gaussian(1.0)).resample(rng, population, 2)
 >>> float(chosen.particles[1]), chosen.weights
@@ -260,7 +261,8 @@ def leader_clusters(weights: np.ndarray, similarity: np.ndarray, at_least: float
     """(m,) cluster of each particle; -1 if the weight of the particle is zero.
 
     The heaviest unassigned particle becomes the leader of a new cluster. All unassigned particles with a similarity
-    to the leader of `at_least` or more join the cluster. The procedure ends when all particles are assigned.
+    to the leader of `at_least` or more join the cluster. The procedure ends when all particles are assigned. Of
+    several particles with equal weights, the first becomes the leader.
     """
     cluster = np.full(len(weights), -1, np.int64)
     number = 0

@@ -151,8 +151,10 @@ class Resampler(Component):
     Every scheme promises the following. Its only check is `mstfilter.smc.testing.ResamplerContract`; a filter trusts
     a scheme and does not count its particles.
 
-    - The particles are those at the ancestors, with their other parents. A particle of weight 0 is never selected.
-    - There are n of them, unless `exact_size` or `chooses_n` say otherwise.
+    - The particles are those at ``parents["ancestor"]``, and keep the parents that they had, such as "previous" and
+      "proposed". A particle of weight 0 is never selected.
+    - There are n of them. If `exact_size` is False there can be fewer, but at least one; if `chooses_n` is True as
+      well, there can be more.
     - If it is `properly_weighted`, the copies of particle i carry in expectation the weight W_i that it had; with
       equal output weights, these are n W_i copies.
     - A common factor of all weights changes nothing but the log weights of the result.

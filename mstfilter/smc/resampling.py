@@ -11,8 +11,12 @@ Residual        floor(n W_i), the rest by independent draws        f (1 - f / R)
 Stratified      one draw in each of n equal strata of [0, 1)       sum over strata of p (1 - p)
 Systematic      one draw, shifted to each stratum                  f (1 - f)
 Ssp             floor or ceil, fractions decided pair by pair      f (1 - f)
-Killing         survive with w_i / max w, else multinomial         see `Killing`
+Killing         survive with w_i / max w, else multinomial         0 if all weights are equal, see below
+LargestWeights  the n largest, without draws                       0
 ==============  =================================================  ====================================
+
+For `Killing` with n = m particles and p = w / max w, the variance of N_i is
+``p_i (1 - p_i) (1 - 2 W_i) + W_i^2 sum p (1 - p) + (m - sum p) W_i (1 - W_i)``.
 
 What matters for an estimate is also how the copies of different particles vary together. So for particles in an
 unlucky order `Systematic` can be worse than `Multinomial`, though not for sorted ones (`Sorted`).
@@ -26,9 +30,6 @@ array([0, 0, 1, 2])
 Weights need not sum to 1, may have any float type, and may be zero (log weight -inf). n may differ from the number of
 weights. A particle of weight zero is never selected. The `select` method of your own `WeightResampler` can use
 `inverse_cdf`, `independent_draws` and `draw_rows`.
-
-Of several particles with equal weights, `LargestWeights` and `leader_clusters` take the first; for the random schemes
-ties play no role.
 
 References: Douc, Cappe, Moulines (2005), "Comparison of resampling schemes for particle filtering"; Kitagawa (1996);
 Liu and Chen (1998).
@@ -166,8 +167,7 @@ class Killing(WeightResampler):
 
     Most particles keep their positions if the weights are nearly equal. The reference for n = m is Del Moral (2004),
     "Feynman-Kac formulae", section 5.6. For n != m, each of the m particles has floor(n / m) of the n positions, or
-    one more at random. The particle of each position is then kept or replaced. E[N_i] = n W_i for any n. For n = m
-    and p = w / max w, var N_i = p_i (1 - p_i) (1 - 2 W_i) + W_i^2 sum p (1 - p) + (m - sum p) W_i (1 - W_i).
+    one more at random. The particle of each position is then kept or replaced. E[N_i] = n W_i for any n.
     """
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:

@@ -201,7 +201,7 @@ def time_figure(
         handles = {line.get_label(): line for axes in panels for line in axes.get_lines() if line.get_label() in arms}
         named = [arm for arm in arms if arm in handles]
         figure.legend([handles[arm] for arm in named], named, loc="outside lower center", ncols=_columns(named))
-        return _svg_text(figure, f"{measure.capitalize()} over time by family and method")
+        return _svg_text(figure, f"{measure.capitalize()} over time by family and arm")
 
 
 def _columns(names: Iterable[str]) -> int:
@@ -274,7 +274,7 @@ def differences_figure(
     with _style("study differences"):
         figure, (axes,) = _new_figure(6.6, 1.0 + 0.26 * forest_height(rows))
         draw_forest(axes, rows, [d.values for *_, d in differences])
-        parts = [f"{measure} of the method minus that of {reference}"]
+        parts = [f"{measure} of the arm minus that of {reference}"]
         parts += [f"{reference} is better on the {side}"] if side else []
         label = "\n".join(line for part in parts for line in textwrap.wrap(part, 76))
         figure.supxlabel(label, fontsize=10, color=_MUTED)

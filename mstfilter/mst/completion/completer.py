@@ -8,9 +8,9 @@ a time and without regard to other segments, so hypotheses that have a segment i
 
 To add a method, inherit `Completer` and override `fill`. It gets an `ObservedBox`, a small box of the grid around the
 object, and returns the probability of each voxel. `complete` takes care of the rest: it clears the voxels that are
-observed as free, and keeps the visible surface. If your method is faster for many boxes together, override
-`fill_many`. An array of the wrong shape, or with numbers that are not probabilities, is an error
-(`mstfilter.base.results`).
+observed as free, and if no voxel then reaches a probability of 0.5, it puts back the visible surface, so that no
+visible object is lost. If your method is faster for many boxes together, override `fill_many`. An array of the wrong
+shape, or with numbers that are not probabilities, is an error (`mstfilter.base.results`).
 
 `arbitrate` makes the label grid. If several completions contain a voxel,
 

@@ -13,18 +13,26 @@ sample and no prediction separates form a cell, so the cells are the common refi
 partition need only be decided between cells. Cells that belong to one object in some sample or prediction are
 connected; a component is a connected set of them, and is decided on its own.
 
-Are two cells one object? Let f_image be the share of the samples in which they are, and f_prediction the
-corresponding weighted share of the predictions. The log odds l of "one object" are a sum:
+Are two cells one object? Image and past both answer by a share. The image says f_image, the share of the samples in
+which the two are one object. The past says f_prediction, the share by weight of those predictions that have an object
+at both cells. A share becomes log odds by its logit, for which 0.02 is added to f and to 1 - f, so that no answer is
+certain.
+
+How much the past counts depends on how far it can be trusted. A prediction is *valid* if it shows the present scene,
+and it counts with its weight times the probability that it is. Three sums of these products matter:
+
+- R, of all predictions: the probability that any of them is valid;
+- W <= R, of those with an object at both cells, which alone have an answer;
+- M <= W, of those in which both cells have moved as one body.
+
+If no prediction is valid, the image decides alone; else image and past add up. So the log odds of "one object" are
 
     ``l = (1 - R) (image_only_constant + image_only logit(f_image))
     + R (constant + image logit(f_image)) + W (prediction logit(f_prediction) + prediction_constant) + M together``
 
-R is the probability that a prediction is valid, W <= R the total weight of the predictions with an object at both
-cells, and M <= W that of the predictions in which both have moved as one body. The update gives one prediction at a
-time a weight above 0, so there f_prediction is 0 or 1. In the logit, 0.02 is added to f and to 1 - f. The
-coefficients are the fields of `PairEvidence`; by default, logit(f_image) is not scaled. The coefficient of the
-predictions was fitted to pairs of cells, and the constants were chosen by a study
-(`experiments/weights` and the page of settled studies in the docs).
+The update gives one prediction at a time a weight above 0, so there f_prediction is 0 or 1. The coefficients are the
+fields of `PairEvidence`; by default, logit(f_image) is not scaled. That of the predictions was fitted to pairs of
+cells, and the constants were chosen by a study (`experiments/weights` and the page of settled studies in the docs).
 
 The alternatives of a component are its partitions in the samples and in the predictions. Where a prediction has no
 object at a cell, each sample in turn says which predicted object the cell joins. The alternatives then get
@@ -340,7 +348,11 @@ class PairTerms(NamedTuple):
 
 @dataclass(frozen=True)
 class PairEvidence(PairOdds):
-    """Log odds from the shares of the samples and of the predictions in which two cells belong to one object."""
+    """Log odds from the shares of the samples and of the predictions in which two cells belong to one object.
+
+    It is the default of the field `pairs` of the update. (The field `evidence` holds other things, terms of a score.)
+    The fields are the coefficients of the formula above, which `PairTerms` explains.
+    """
 
     image_only_constant: float = 0.0
     image_only: float = 1.0

@@ -7,17 +7,23 @@ This update takes the place of section IV-D of the paper. It treats samples and 
 last frame: which of its depth readings belong together. Voxels are not fused at all; those of an object are estimated
 anew from everything that was seen of it.
 
+A *candidate* is one complete answer: it chooses a prediction j, a partition of the readings of each part of the
+image, and the occluded objects that stay. Its weight is
+
+    ``w_j Q_j^lambda`` times the probabilities of its partitions and of its choice of occluded objects,
+
+where w_j is the weight of prediction j, and Q_j tells how well the observed free space agrees with it.
+
 1. **Free space.** As in the paper, Q_j is the share of the voxels of prediction j that the frame does not observe as
-   free. Its visible surface is tested too: the readings agree with the share A_j of it, and A_j^lambda is the
-   probability that the prediction is *valid*, which means that it shows the present scene. A single object can fail
-   as well. If the readings agree with less than the share `least_agreement` of its visible surface, it is *refuted*,
-   and no candidate contains it.
+   free. Its visible surface is tested too: A_j is the share of it with which the readings agree, and A_j^lambda is
+   the probability that the prediction is *valid*, which means that it shows the present scene. (The exponent lambda
+   is the field `quality_exponent`.) A single object can fail as well: if the readings agree with less than the share
+   `least_agreement` of its visible surface, it is *refuted*, and no candidate contains it.
 2. **Partitions.** A sample groups the readings by segment, a prediction by the predicted object at each reading. The
    samples and prediction j together give the odds that two readings belong to one object, and these determine the
-   probabilities of the partitions of each part of the image (`mstfilter.mst.partition.cells`). A candidate is a
-   prediction j, one partition of each part, and the occluded objects that stay (step 4). Its weight is w_j Q_j^lambda
-   times the probabilities of these choices (`mstfilter.mst.partition.candidates`). Only the most probable candidates
-   are described, and only those that the resampler of the filter selects are completed.
+   probabilities of the partitions of each part of the image (`mstfilter.mst.partition.cells`). Only the most probable
+   candidates are described (`mstfilter.mst.partition.candidates`), and only those that the resampler of the filter
+   selects are completed.
 3. **Association.** Segments and predicted objects are the vertices of a *conflict graph*. In each of its components,
    the rules in `mstfilter.mst.partition.association` decide which segment continues which object. Merges follow from
    the partition; in the paper, they are drawn at random.
@@ -28,11 +34,22 @@ anew from everything that was seen of it.
    (`mstfilter.scene.ObjectView`). A visible object is completed from its readings and from the views of the predicted
    objects that it continues, an occluded one from its views alone. The completer drops views that contradict the
    frame, and an object without any voxel is removed. Completions of earlier pauses are not used again, so their
-   errors do not add up. The one exception are completers that do not use views: without any, an occluded object keeps
+   errors do not add up. Only an occluded object without any view, as with completers that use none, keeps
    its predicted voxels outside free space.
 
 At the first pause the candidates are the distinct samples, and every segment is a new object. So a hypothesis
 contains only objects that some frame has shown.
+
+To change one factor of the weight, replace the field that makes it:
+
+==================  ==================================================================================
+`free_space`        what counts as free, so Q_j and q: a `mstfilter.scene.Projection`
+`pairs`             image against past: a `PairOdds`; common motion is the field `together` of `PairEvidence`
+`temperature`       how even the probabilities of partitions are
+`quality_exponent`  how strongly Q_j, A_j and q count
+`least_agreement`   whether surfaces are tested at all, and when an object is refuted
+`evidence`          further factors: terms of your own (`mstfilter.scene.Evidence`), for which candidates are built
+==================  ==================================================================================
 
 The notes of the result contain all candidates as segmentations of the last frame with their weights
 (`mstfilter.scene.WeightedSegmentations`). A belief reads its probabilities there, rather than from the few hypotheses
@@ -119,7 +136,8 @@ class PartitionUpdate(Update):
     Parameters
     ----------
     completer : Completer
-        Completes the objects. The completions of the proposal are not used, so the proposal can use `SurfaceOnly`.
+        Completes the objects. The shapes that the completer of the proposal made only say which depth readings
+        belong to a segment, so `SurfaceOnly` is enough there.
     free_space : Projection
         Computes the voxels of a prediction that the frame does not observe as free, and their share Q.
     pairs : PairOdds

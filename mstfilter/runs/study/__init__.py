@@ -6,8 +6,8 @@
 >>> result.folder.summary().compared()[0].words
 
 `run_study` plans the runs, which are every arm (configuration of the filter) on every scene with every seed. Worker
-processes make those that are missing, all runs of one recording in one worker, each as a `mstfilter.runs.RunFolder`.
-Then the tables of the study folder are written from them.
+processes make those that are missing: one worker makes all runs of a recording, and every run has a folder of its own
+(`mstfilter.runs.RunFolder`). Then the tables of the study folder are written from the runs.
 
 =========  =======================================================================================
 `config`   a study as written in its file: scenes, arms, seeds, metrics

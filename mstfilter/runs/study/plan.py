@@ -6,7 +6,8 @@
 The identity of a run is a hash of its configuration, its recording, its seed, the code of mstfilter and of the user's
 files, and the versions of the libraries. Comments and docstrings do not count as code. For a simulated recording, the
 family, the seed and the version of the simulator are hashed, for other recordings the content and the ground truth.
-A run is not repeated if its identity has not changed. Own metrics are no part of it: finished runs are measured.
+A run is not repeated if its identity has not changed. Your own metrics are not part of the identity: a new one is
+measured on the hypotheses of the finished runs. (With ``keep = "tables"`` these are gone, so the runs are repeated.)
 """
 
 from __future__ import annotations

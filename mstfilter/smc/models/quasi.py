@@ -13,8 +13,9 @@ there are several dimensions (Gerber and Chopin 2015, "Sequential quasi-Monte Ca
 True
 
 The model does not change: `SobolGenerator` hands the points to it where it asks a generator for random numbers. The
-evidence is unbiased, because each scrambled point is uniform. In many dimensions (more than about ten numbers per
-particle and step) little of the gain is left.
+evidence is unbiased, because each scrambled point is uniform. The points have as many dimensions as a particle takes
+random numbers in a step, and they fill high dimensions less evenly: with more than about ten numbers, errors are
+little smaller than with random points.
 """
 
 from __future__ import annotations
