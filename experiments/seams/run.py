@@ -1,13 +1,13 @@
 """How well does the tree with seams tell one object from two, in simulated and in real images?
 
-    python experiments/seams/run.py samples FOLDER        # training samples of the labelled real images
-    python experiments/seams/run.py score --out FOLDER [--judge MODEL] [--fold hots=MODEL,osd=MODEL]
-        [--priors .85:3.5,.5:1000] [--scenes s1,s2,s3] [--seeds 0-9] [--no-real]
-    python experiments/seams/run.py score --smoke --out FOLDER
+    python experiments/seams/run.py --samples FOLDER      # training samples of the labelled real images
+    python experiments/seams/run.py [--judge MODEL] [--fold hots=MODEL,osd=MODEL] [--priors .85:3.5,.5:1000]
+        [--scenes s1,s2,s3] [--seeds 0-9] [--no-real] [--out FOLDER]
+    python experiments/seams/run.py --smoke --out FOLDER
 
-Both need the data in MSTFILTER_SHARED (default ../shared) under real/; `score` works without.
+Real images are those in MSTFILTER_SHARED (default ../shared) under real/; without them, simulated ones alone.
 
-`score` compares the trees `border` and `seams` on label images: the first pauses of simulated scenes, and all
+The script compares the trees `border` and `seams` on label images: the first pauses of simulated scenes, and all
 labelled pauses of HOTS and OSD. On real images the border model and the judge are those of a fold, so neither was
 fitted to frames of that camera set-up (the border model, for OSD: of that group). With 30 exact draws for each image:
 
@@ -198,24 +198,23 @@ def summaries(rows: Rows) -> Rows:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    commands = parser.add_subparsers(dest="command", required=True)
-    samples = commands.add_parser("samples")
-    samples.add_argument("folder", type=Path)
-    score = commands.add_parser("score")
-    score.add_argument("--out", type=Path, required=True)
-    score.add_argument("--judge", default="", help="model of the judge for simulated images; default: no judge")
-    score.add_argument("--fold", default="", help="hots=MODEL,osd=MODEL: judges that have not seen these frames")
-    score.add_argument("--priors", default="0.85:3.5", help="one_share:prior_size, separated by commas")
-    score.add_argument("--scenes", default="s1,s2,s3")
-    score.add_argument("--seeds", default="0-9")
-    score.add_argument("--no-real", action="store_true")
-    score.add_argument("--no-base", action="store_true")
-    score.add_argument("--every", type=int, default=1, help="use every so many of the real frames")
-    score.add_argument("--smoke", action="store_true", help="one scene, no real image")
+    parser.add_argument("--samples", type=Path, help="write training samples of the real images into this folder")
+    parser.add_argument("--judge", default="seams", help="model of the judge for simulated images; empty for none")
+    parser.add_argument("--fold", default="", help="hots=MODEL,osd=MODEL: judges that have not seen these frames")
+    parser.add_argument("--priors", default="0.85:3.5", help="one_share:prior_size, separated by commas")
+    parser.add_argument("--scenes", default="s1,s2,s3")
+    parser.add_argument("--seeds", default="0-9")
+    parser.add_argument("--no-real", action="store_true")
+    parser.add_argument("--no-base", action="store_true")
+    parser.add_argument("--every", type=int, default=1, help="use every so many of the real frames")
+    parser.add_argument("--smoke", action="store_true", help="one scene, no real image; needs --out")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     chosen = parser.parse_args()
-    if chosen.command == "samples":
-        write_samples(chosen.folder)
+    if chosen.smoke:
+        if chosen.out == parser.get_default("out"):
+            parser.error("--smoke would overwrite the results: name another folder with --out")
+        chosen.scenes, chosen.seeds, chosen.no_real = "s1", "0", True
+    if chosen.samples:
+        write_samples(chosen.samples)
     else:
-        if chosen.smoke:
-            chosen.scenes, chosen.seeds, chosen.no_real = "s1", "0", True
         main(chosen)
