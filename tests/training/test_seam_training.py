@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from mst_training.loop import run_training
 from mst_training.seam_data import SeamSamples, _purity
-from mst_training.seams import SeamsTraining, region_losses
+from mst_training.seams import SeamsTraining, _Source, region_losses
+from mstfilter.base.errors import InputError
 from mstfilter.mst.segmentation.divisions import Division
 from mstfilter.mst.segmentation.seam_measures import STRIP, STRIP_CHANNELS
 from mstfilter.mst.segmentation.seam_network import INPUTS, load_seam_network
+from mstfilter.scene import render
+from tests.mst.segmentation.scenes import GRID, boxes, camera, frame_of
 
+ROW = boxes(((20, 20, 0), (32, 34, 10)), ((32, 20, 0), (46, 34, 10)))
 SMALL = SeamsTraining(n_scenes=1, n_validation=1, n_test=1, width=8, steps=60, batch=6, rate=1e-2, average=0.8)
 
 
@@ -51,6 +57,40 @@ def test_training_learns_which_division_separates(tmp_path, monkeypatch):
     new = samples(9)
     scores = judge.scores(new.x, new.strip)
     assert scores[new.purity == 1].min() > np.median(scores[new.purity == 0])
+
+
+def test_further_samples_join_every_batch(tmp_path):
+    samples(3).save(tmp_path / "desk.npz")
+    replace(samples(4), objects=np.full(120, 3, np.int32)).save(tmp_path / "shelf.npz")
+    settings = replace(SMALL, extra=str(tmp_path), extra_without="desk", extra_batch=5)
+    for *_, region, objects, prior in settings.batches(samples(1), 0, 3):
+        assert len(objects) == len(prior) == settings.batch + 5 and (objects[-5:] == 3).all()
+        assert region.unique().tolist() == list(range(len(objects)))
+    with pytest.raises(InputError, match="no files of samples"):
+        next(replace(settings, extra_without="desk, shelf").batches(samples(1), 0, 1))
+
+
+def test_the_prior_is_the_share_of_one_in_scenes_of_a_kind():
+    given = samples(5)
+    rows = np.arange(0, 120, 3)
+    one, grouped = given.objects[rows] < 2, given.grouped[rows]
+    prior = _Source.of(given).prior
+    for kind in (False, True):
+        own = grouped == kind
+        expected = np.log((one[own].sum() + 1) / ((~one)[own].sum() + 1))
+        assert prior[own] == pytest.approx(expected)
+
+
+def test_a_labelled_image_gives_samples():
+    frame = frame_of(ROW, width=320, noise=0.3)
+    truth = render(ROW, GRID, camera(320)).labels.astype(int)
+    found = SeamSamples.of_frame(frame, GRID, truth)
+    assert not found.grouped.any() and set(found.objects[found.depth == 0]) <= {1, 2}
+    assert (found.objects == 2).any() and found.purity.max() > 0.95
+    with pytest.raises(InputError, match="labels"):
+        SeamSamples.of_frame(frame, GRID, truth[:-1])
+    with pytest.raises(InputError, match="no region"):
+        SeamSamples.of_frame(frame, GRID, 0 * truth)
 
 
 def test_region_losses_are_those_of_the_formula():
