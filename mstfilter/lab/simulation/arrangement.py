@@ -446,13 +446,14 @@ def arrange_objects(
     """
     empty = world.save()
     twins = sum(t >= 0 for t in objects.twin_of)
-    for attempt in range(_ATTEMPTS):
+    most = 2 * _ATTEMPTS  # of a dense scene of meshes, one attempt in twenty succeeds
+    for attempt in range(most):
         world.restore(empty)
         n_touching = (twins if twins < 3 else twins - 1) if attempt < _PATIENCE else (twins + 1) // 2
         n_unseen = (family.n_hidden + 1) // 2 if attempt < 2 * _PATIENCE else 0
         if _try_arrangement(rng, world, family, objects, n_touching, n_unseen):
             return
     raise InputError(
-        f"scene family {family.name!r}: {world.n_objects} objects could not be arranged in {_ATTEMPTS} attempts",
+        f"scene family {family.name!r}: {world.n_objects} objects could not be arranged in {most} attempts",
         "use fewer or smaller objects, or fewer twins",
     )
