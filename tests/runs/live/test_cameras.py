@@ -13,7 +13,7 @@ import pytest
 
 import mstfilter
 from mstfilter.base.errors import InputError, InputWarning
-from mstfilter.scene import Recording, project
+from mstfilter.scene import Recording, outlined
 from tests.conftest import REPOSITORY
 from tests.formats.bags import COLOUR, DEPTH, scene_messages, topic_info
 from tests.formats.layouts import FPS, SHIFTS, units, video
@@ -43,7 +43,7 @@ def test_the_node_has_the_results_of_the_frames_in_its_messages():
     states = [state for state, _ in QUICK.iterate(recording.clips(), 4)]
     assert [arrays(pause.state) for pause in found] == [arrays(state) for state in states]
     estimate = mstfilter.Belief(found[1].state.population).estimate()
-    np.testing.assert_array_equal(NODE.label_image(found[1]), project(estimate, found[1].clip.after.camera))
+    np.testing.assert_array_equal(NODE.label_image(found[1]), outlined(estimate, found[1].clip.after))
     belief = json.loads(NODE.belief_json(found[1]))
     assert sum(one["weight"] for one in belief["hypotheses"]) == pytest.approx(1, abs=1e-4)
     best = max(belief["hypotheses"], key=lambda one: one["weight"])
