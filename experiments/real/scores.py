@@ -18,7 +18,7 @@ from sequences import WALL, Truth
 from mstfilter import Belief
 from mstfilter.scene import Camera, Frame, Hypothesis, VoxelGrid, frame_geometry, scaled_area
 from mstfilter.scoring import weighted_coverage
-from mstfilter.scoring.forecasts import SOFTENING
+from mstfilter.scoring.forecasts import ForecastTable
 
 PIECE = 0.1  # share of a true object's pixels that an object needs to be a piece of it
 FOUND = 0.25  # share of a true object's pixels that objects must cover, else it is missed; likewise for invented ones
@@ -26,6 +26,7 @@ TALL = 0.04  # metres above the table
 READABLE = 0.25  # share of an object's pixels that need a reading to count in `quality_readable`
 # Metres: witness surface above the table, behind depth 1, before depth 2; distance of surface of the wall.
 LEAST = 200  # pixels of an object that pairs of pixels are drawn from, in an image of 640 x 480
+SOFTENING = 0.04  # of forecasts for pairs of pixels, as `ForecastTable.log_loss` has it: none is below .02
 PAIRS = 12  # of pixels, for each object and each pair of objects that touch
 _TOUCH = 5  # pixels: windows in which two objects touch
 _SEEN, _BEHIND, _FRONT, _AT_WALL = 0.03, 0.02, 0.03, 0.03
@@ -110,7 +111,7 @@ def touching_pairs(labels: np.ndarray, objects: Several[int]) -> list[tuple[int,
 
 
 def pixel_log_loss(belief: Belief, camera: Camera, labels: np.ndarray) -> float:
-    """Mean log loss in nats of "do these two pixels show one object?", with forecasts softened by .02.
+    """Mean log loss in nats of "do these two pixels show one object?", with forecasts softened to .02 and more.
 
     A pixel without an object shows none, so a missed object costs. NaN without objects.
     """
@@ -119,8 +120,7 @@ def pixel_log_loss(belief: Belief, camera: Camera, labels: np.ndarray) -> float:
         return np.nan
     rows = [np.divmod(flat, labels.shape[1]) for flat in (pairs.a, pairs.b)]
     forecast = belief.same_object_at_pixels(camera, *(np.column_stack([c, r]) for r, c in rows))
-    p = SOFTENING + (1 - 2 * SOFTENING) * np.where(pairs.same, forecast, 1 - forecast)
-    return float(-np.log(p).mean())
+    return ForecastTable.of(np.clip(forecast, 0, 1), pairs.same).log_loss(SOFTENING)
 
 
 def _heights(frame: Frame, labels: np.ndarray, objects: np.ndarray) -> list[np.ndarray]:

@@ -20,6 +20,7 @@ ratio to `random` with a bootstrap interval over scenes.
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,31 +33,28 @@ from mstfilter.base.files import write_csv
 from mstfilter.lab.simulation import FingerPush, PushLoop, scene_family
 from mstfilter.mst.belief import PushCandidate, push_candidates
 from mstfilter.scene import scaled_area, scene_cache
-from mstfilter.scoring.forecasts import SOFTENING
+from mstfilter.scoring.forecasts import ForecastTable
+
+sys.path.append(str(Path(__file__).resolve().parent.parent / "worlds"))
+from one_or_two import VISIBLE, is_one, visible_parts
 
 REACH = ((-0.5, -0.5, 0.0), (0.5, 0.5, 0.4))
 POLICIES = ("information", "random border", "random", "largest")
-VISIBLE, RIGHT = 200, 0.9  # readings of a visible part in an image of 640 x 480; probability from which it is right
+SOFTENING = 0.04  # see `ForecastTable.log_loss`
+RIGHT = 0.9  # probability from which a forecast is right
 Row = dict[str, object]
 
 
 def forecasts(belief: Belief, loop: PushLoop) -> dict[int, float]:
     """Probability of "one object" for each group with at least two visible parts."""
     refined, mass = belief.refined_image(loop.clip.after.camera)
-    parts, last, found = loop.part_image(), 0, {}
-    for number, group in enumerate(loop.groups):
-        first, last = last + 1, last + len(group["parts"])
-        own = [refined.cells[parts == k] for k in range(first, last + 1)]
-        own = [cells for cells in own if len(cells) >= scaled_area(VISIBLE, parts.size)]
-        if len(own) < 2:
-            continue
-        main = []
-        for cells in own:
-            counts = np.bincount(cells, minlength=len(refined.sizes)).astype(float)
-            main.append([np.bincount(row, counts).argmax() for row in refined.objects])
-        same = (np.array(main) == main[0]).all(axis=0) & (np.array(main[0]) > 0)
-        found[number] = float(np.clip(mass @ same, 0, 1))
-    return found
+    image = loop.part_image()
+    parts = visible_parts(image, loop.groups, scaled_area(VISIBLE, image.size))
+    objects = refined.objects[:, refined.cells]
+    return {
+        number: float(np.clip(mass @ np.array([is_one(row, own) for row in objects]), 0, 1))
+        for number, own in parts.items()
+    }
 
 
 def chosen(policy: str, belief: Belief, loop: PushLoop, rng: np.random.Generator) -> FingerPush | PushCandidate:
@@ -112,8 +110,8 @@ def of_scene(rows: list[Row], most: int) -> Row:
     """Pushes until a scene was decided, and the log loss at its last pause."""
     last = max(int(row["pushes"]) for row in rows)  # type: ignore[call-overload]
     own = [row for row in rows if row["pushes"] == last]
-    p = np.array([row["forecast"] if row["one"] else 1 - float(row["forecast"]) for row in own], float)  # type: ignore[arg-type]
-    loss = -np.log(SOFTENING + (1 - 2 * SOFTENING) * p).mean()
+    p, one = (np.array([row[name] for row in own], float) for name in ("forecast", "one"))
+    loss = ForecastTable.of(p, one).log_loss(SOFTENING)
     n = last if all(right(row) for row in own) else most + 1
     return {name: rows[0][name] for name in ("policy", "family", "seed")} | {"pushes": n, "log_loss": round(loss, 3)}
 

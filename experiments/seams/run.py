@@ -26,6 +26,7 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import chain, islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -38,12 +39,12 @@ from mstfilter.lab.simulation import SCENE_FAMILIES, SimulatedScene
 from mstfilter.mst.segmentation import BorderTree, ExactCuts, ObjectRule, SeamTree, TreeCutProposal, optimal_cut
 from mstfilter.scene import Frame, VoxelGrid, scene_cache
 from mstfilter.scoring import weighted_coverage
-from mstfilter.scoring.forecasts import SOFTENING
+from mstfilter.scoring.forecasts import ForecastTable
 
 REAL = Path(__file__).resolve().parent.parent / "real"
 sys.path.append(str(REAL))
 from folds import border_model  # noqa: E402
-from scores import PixelPairs  # noqa: E402
+from scores import SOFTENING, PixelPairs  # noqa: E402
 from sequences import SHARED, sequences  # noqa: E402
 
 DRAWS, PIECE = 30, 0.1  # draws for each image; share of the pixels of a true object in a piece of it
@@ -60,13 +61,13 @@ class Labelled(NamedTuple):
     labels: np.ndarray
 
 
-def real_images() -> Iterator[tuple[str, Labelled]]:
-    """Data set and image of every labelled pause of HOTS and OSD."""
+def real_images() -> Iterator[Labelled]:
+    """Every labelled pause of HOTS and OSD."""
     for sequence in sequences(SHARED):
         if sequence.source in ("hots", "osd"):
             for clip in sequence.recording.clips():
                 labels = sequence.truth(clip.index).labels
-                yield sequence.source, Labelled(sequence.source, sequence.name, clip.after, clip.grid, labels)
+                yield Labelled(sequence.source, sequence.name, clip.after, clip.grid, labels)
 
 
 def simulated_images(families: list[str], seeds: range) -> Iterator[Labelled]:
@@ -86,7 +87,7 @@ def simulated_images(families: list[str], seeds: range) -> Iterator[Labelled]:
 def write_samples(folder: Path) -> None:
     """A file of samples for each sequence."""
     found: dict[str, list[SeamSamples]] = {}
-    for k, (_, image) in enumerate(real_images()):
+    for k, image in enumerate(real_images()):
         tree = BorderTree(weights=border_model(image.name))
         try:
             samples = SeamSamples.of_frame(image.frame, image.grid, image.labels, k, tree)
@@ -124,7 +125,10 @@ def scored(image: Labelled, proposal: TreeCutProposal) -> dict[str, float]:
     asked = both.any(axis=0)
     forecast = ((first == second) & both).sum(axis=0)[asked] / both.sum(axis=0)[asked]
     same = pairs.same[asked]
-    loss = -np.log(SOFTENING + (1 - 2 * SOFTENING) * np.where(same, forecast, 1 - forecast))
+
+    def loss(of: np.ndarray) -> float:
+        return ForecastTable.of(forecast[of], same[of]).log_loss(SOFTENING) if of.any() else np.nan
+
     return {
         "objects": len(pairs.objects),
         "pairs": len(pairs.touching),
@@ -132,9 +136,9 @@ def scored(image: Labelled, proposal: TreeCutProposal) -> dict[str, float]:
         "quality": float(np.mean(quality[1:])),
         "merged": float(np.mean(merged)) if merged else np.nan,
         "split": float(np.mean(split)),
-        "log_loss": float(loss.mean()),
-        "log_loss_same": float(loss[same].mean()),
-        "log_loss_different": float(loss[~same].mean()) if not same.all() else np.nan,
+        "log_loss": loss(np.ones_like(same)),
+        "log_loss_same": loss(same),
+        "log_loss_different": loss(~same),
         "seconds": seconds,
     }
 
@@ -146,10 +150,10 @@ def main(options: argparse.Namespace) -> None:
     first, last = (int(n) for n in (options.seeds.split("-") * 2)[:2])
     rows: Rows = []
     simulated = simulated_images([n for n in options.scenes.split(",") if n], range(first, last + 1))
-    images = [("", one) for one in simulated] if options.no_real else _chain(simulated, options.every)
-    for source, image in images:
-        base = BorderTree(weights=border_model(image.name) if source else "border")
-        judge = folds.get(source, options.judge)
+    real = () if options.no_real else islice(real_images(), 0, None, options.every)
+    for image in chain(simulated, real):
+        base = BorderTree(weights=border_model(image.name))
+        judge = folds.get(image.group, options.judge)
         trees: list[tuple[str, str, BorderTree | SeamTree]] = [] if options.no_base else [("border", "", base)]
         if judge:
             trees += [
@@ -167,13 +171,6 @@ def main(options: argparse.Namespace) -> None:
     write_csv(options.out / "summary.csv", summary)
     for row in summary:
         print(*row.values(), sep=", ")
-
-
-def _chain(simulated: Iterator[Labelled], every: int) -> Iterator[tuple[str, Labelled]]:
-    yield from (("", one) for one in simulated)
-    for k, found in enumerate(real_images()):
-        if k % every == 0:
-            yield found
 
 
 def summaries(rows: Rows) -> Rows:

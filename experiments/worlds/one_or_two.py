@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -70,14 +70,10 @@ def questions(recording: Recording, filter: ParticleFilter) -> Iterator[dict[str
     """The forecast of each group of a recording with at least two visible parts."""
     clip = next(iter(recording.clips()))
     readings, objects, weights = candidates(filter, clip)
-    parts = part_image(recording, recording.pauses[0])
-    part, least, last = readings.of_image(parts), scaled_area(VISIBLE, parts.size), 0
-    for number, group in enumerate(recording.manifest["groups"]):
-        first, last = last + 1, last + len(group["parts"])
-        own = [part == k for k in range(first, last + 1)]
-        own = [one for one in own if one.sum() >= least]
-        if len(own) < 2:
-            continue
+    image, groups = part_image(recording, recording.pauses[0]), recording.manifest["groups"]
+    parts = visible_parts(readings.of_image(image), groups, scaled_area(VISIBLE, image.size))
+    for number, own in parts.items():
+        group = groups[number]
         joined = np.array([is_one(row, own) for row in objects])
         yield {
             "group": number,
@@ -88,6 +84,21 @@ def questions(recording: Recording, filter: ParticleFilter) -> Iterator[dict[str
             "has_one": int(any(shows(row, [np.any(own, axis=0)]) for row in objects)),
             "has_several": int(any(shows(row, own) for row in objects)),
         }
+
+
+def visible_parts(part: np.ndarray, groups: Sequence[Mapping[str, Any]], least: float) -> dict[int, list[np.ndarray]]:
+    """The parts as masks (m,) bool of each group with at least two visible ones, from the part (m,) of each pixel.
+
+    A part is visible if it has `least` pixels. Parts are numbered from 1, in the order of the groups.
+    """
+    found, last = {}, 0
+    for number, group in enumerate(groups):
+        first, last = last + 1, last + len(group["parts"])
+        own = [part == k for k in range(first, last + 1)]
+        own = [one for one in own if one.sum() >= least]
+        if len(own) > 1:
+            found[number] = own
+    return found
 
 
 def is_one(objects: np.ndarray, parts: Sequence[np.ndarray]) -> bool:

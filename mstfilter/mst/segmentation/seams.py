@@ -230,7 +230,8 @@ class _Examination:
         self.flat = regions.image.ravel()
         self.least = least_examined(self.flat.size)
         self.measures = SeamMeasures.of(image, regions.image > 0)
-        self.judged = {node: self._judged(*self.base.region(node), False) for node in self.clear | self.uncertain}
+        self.regions = {node: self.base.region(node) for node in self.clear | self.uncertain}
+        self.judged = {node: self._judged(*region, False) for node, region in self.regions.items()}
         log_odds = np.array([one.log_odds for one in self.judged.values() if np.isfinite(one.log_odds)])
         self.prior = SharedPrior.of(log_odds, builder.one_share, builder.prior_size)
         self.least_odds = log(max(builder.least, 1e-9) / max(1 - builder.least, 1e-9))
@@ -258,8 +259,7 @@ class _Examination:
 
     def _upper(self, node: int) -> tuple[str, int]:
         if node in self.uncertain:
-            pixels, parts = self.base.region(node)
-            return self._examined(node, pixels, parts, self.judged[node], depth=0)
+            return self._examined(node, *self.regions[node], self.judged[node], depth=0)
         merge = self.base.merge_of(node)
         assert merge is not None
         a, b, odds = merge
