@@ -125,18 +125,18 @@ class _Distinct:
         size = int(side.sum())
         if min(size, self.n - size) < self.least:
             return
-        if any(_similarity(side, other.side) > _SAME for other in self.divisions):
+        if any(division_overlap(side, other.side) > _SAME for other in self.divisions):
             return
         overlap, odds = 0.0, _UNKNOWN
         for part in self.parts:
-            if (common := _similarity(side, part.side)) > overlap:
+            if (common := division_overlap(side, part.side)) > overlap:
                 overlap, odds = common, part.odds
         self.divisions.append(
             Division(side, kind, normal, offset, overlap, float(np.clip(odds, _UNKNOWN, -_UNKNOWN)))
         )
 
 
-def _similarity(one: np.ndarray, other: np.ndarray) -> float:
+def division_overlap(one: np.ndarray, other: np.ndarray) -> float:
     """How similar two divisions of a region are, given a side (n,) bool of each: 1 if they are the same."""
     common, a, b, n = int((one & other).sum()), int(one.sum()), int(other.sum()), len(one)
     return max(_overlap(common, a, b, n), _overlap(b - common, n - a, b, n))

@@ -44,12 +44,15 @@ from mstfilter.scene import Frame, pixels_above_table, scaled_length
 
 if TYPE_CHECKING:
     from mstfilter.mst.segmentation.border_network import BorderNetwork, PairNetwork
+    from mstfilter.mst.segmentation.hidden import HiddenJoins
 
 #: Log odds (k,) that the regions of k pairs belong to different objects:
 #: (rows of a, rows of b, borders, table borders of a, of b).
 PairLogOdds = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
-_NO_BORDER = np.zeros(len(BORDER))
+#: A merge of two nodes: their numbers, and the log odds of different objects against one.
+Merge = tuple[int, int, float]
+NO_BORDER = np.zeros(len(BORDER))  #: The row of a pair of regions without a common border.
 _ROOT_ODDS = 30.0  # the root joins the table and regions that never touched
 _MOST_GAP = 4.0
 _FIT = "python experiments/segmentation_fit/run.py"
@@ -89,7 +92,7 @@ class _RegionMeans:
         self.free = self.outline - table[:, 0]
 
 
-class _PairMeasures:
+class PairMeasures:
     """Measurements of k pairs of regions. The parameters are the same as in `pair_features`."""
 
     def __init__(
@@ -130,7 +133,7 @@ class _PairMeasures:
 
 
 #: Features of pairs of regions by name, (k,) each. Those of `EVIDENCE_FEATURES` are 0 without a border network.
-FEATURES: dict[str, Callable[[_PairMeasures], np.ndarray]] = {
+FEATURES: dict[str, Callable[[PairMeasures], np.ndarray]] = {
     "bias": lambda p: np.ones(len(p.length)),
     "strength": lambda p: p.strength,
     "strength^2": lambda p: p.strength**2,
@@ -140,7 +143,7 @@ FEATURES: dict[str, Callable[[_PairMeasures], np.ndarray]] = {
     "clear step share": lambda p: p.clear,
     "lightness": lambda p: np.minimum(np.abs(p.lab[:, 0]) / 20, 3),
     "chroma": lambda p: np.minimum(np.hypot(p.lab[:, 1], p.lab[:, 2]) / 10, 4),
-    "texture": _PairMeasures.texture,
+    "texture": PairMeasures.texture,
     "misfit": lambda p: p.misfit,
     "residual": lambda p: p.residual,
     "border share": lambda p: np.minimum(p.length / np.minimum(p.front.outline, p.back.outline), 1),
@@ -190,7 +193,7 @@ def pair_features(
     `border` (k, B) has the common borders of the pairs, with `a` first. `table_a` and `table_b` (k, B) are the
     borders of `a` and `b` with the table, or zeros. `scale` is the image width / 640.
     """
-    pair = _PairMeasures(a, b, border, table_a, table_b, scale)
+    pair = PairMeasures(a, b, border, table_a, table_b, scale)
     return np.stack([FEATURES[name](pair) for name in names], axis=1)
 
 
@@ -226,9 +229,9 @@ class Agglomeration:
         self.sums = np.zeros((2 * n, regions.sums.shape[1]))
         self.sums[:n] = regions.sums
         self.borders: list[dict[int, np.ndarray]] = [dict(near) for near in regions.borders]
-        self.table = [near.pop(0, _NO_BORDER) for near in self.borders]
+        self.table = [near.pop(0, NO_BORDER) for near in self.borders]
         self.alive = set(range(1, n))
-        self.merges: list[tuple[int, int, float]] = []
+        self.merges: list[Merge] = []
         self.heap: list[tuple[float, int, int]] = []
         for i in range(1, n):
             self._push(i, [j for j in self.borders[i] if j > i])
@@ -262,7 +265,7 @@ class Agglomeration:
         new = len(self.borders)
         self.merges.append((i, j, odds))
         self.sums[new] = self.sums[i] + self.sums[j]
-        common = self.borders[i].pop(j, _NO_BORDER)
+        common = self.borders[i].pop(j, NO_BORDER)
         self.borders[j].pop(i, None)
         self.sums[new, REGION["perimeter"].start] -= 2 * common[0]
         near = {k: row for k, row in self.borders[i].items() if k in self.alive}
@@ -274,7 +277,7 @@ class Agglomeration:
         self.alive -= {i, j}
         self.alive.add(new)
         for k in near:
-            self.borders[k][new] = self.borders[k].pop(i, _NO_BORDER) + self.borders[k].pop(j, _NO_BORDER)
+            self.borders[k][new] = self.borders[k].pop(i, NO_BORDER) + self.borders[k].pop(j, NO_BORDER)
         self._push(new, list(near))
         return new
 
@@ -327,9 +330,13 @@ class MergedTree(TreeBuilder):
                 f"{type(self).__name__} needs the frame of the boundary map", "tree.build(boundary, frame)"
             )
         regions = self.regions(boundary, frame, pixels_above_table(frame) if pixels is None else pixels)
-        return tree_of_merges(regions.image, len(regions.sums), self.merges(regions))
+        return tree_of_merges(regions.image, len(regions.sums), self.joined(self.merges(regions), regions, frame))
 
-    def merges(self, regions: Regions) -> list[tuple[int, int, float]]:
+    def joined(self, merges: list[Merge], regions: Regions, frame: Frame) -> list[Merge]:
+        """The merges of a tree, with nodes for segments that do not touch in the image. Here: no such nodes."""
+        return merges
+
+    def merges(self, regions: Regions) -> list[Merge]:
         """All merges of measured regions, in their order: (node, node, log odds), as in `tree_of_merges`."""
         scale = scaled_length(1, regions.image.shape[1])
         growing = Agglomeration(regions, pair_log_odds(self.model()[0], self.correction(), scale))
@@ -377,9 +384,17 @@ class BorderTree(MergedTree):
         Builds the leaves that are merged.
     weights : str
         Name of a trained model of the package, or the path of a model folder.
+    joins : str
+        Name or JSON file of the weights of `HiddenJoins`: segments on both sides of something nearer can be one
+        object. Empty for no such joins.
     """
 
     weights: str = "border"
+    joins: str = "hidden"
+
+    @property
+    def bound_key(self) -> bytes:
+        return super().bound_key + (self._joins().key.encode() if self.joins else b"")
 
     def model(self) -> tuple[Mapping[str, float], str]:
         network = self._network()
@@ -392,13 +407,21 @@ class BorderTree(MergedTree):
     def correction(self) -> PairNetwork | None:
         return self._network().correction
 
+    def joined(self, merges: list[Merge], regions: Regions, frame: Frame) -> list[Merge]:
+        return self._joins().added(merges, regions, frame) if self.joins else merges
+
+    def _joins(self) -> HiddenJoins:
+        from mstfilter.mst.segmentation.hidden import HiddenJoins
+
+        return HiddenJoins(self.joins)
+
     def _network(self) -> BorderNetwork:
         from mstfilter.mst.segmentation.border_network import load_border_network
 
         return load_border_network(self.weights)
 
 
-def tree_of_merges(image: np.ndarray, n_regions: int, merges: list[tuple[int, int, float]]) -> Tree:
+def tree_of_merges(image: np.ndarray, n_regions: int, merges: list[Merge]) -> Tree:
     """The tree of a list of merges. Merge k makes node n_regions + k, and a root joins what remains.
 
     `image` (H, W) int has the region of every pixel; region 0 is the table. A merge is (node, node, log odds).

@@ -32,7 +32,7 @@ from scipy.special import expit
 
 from mstfilter.base.errors import InputError
 from mstfilter.base.fields import Bounds, PositiveFloat, Share
-from mstfilter.mst.segmentation.divisions import SeamImage, TreePart, divisions
+from mstfilter.mst.segmentation.divisions import SeamImage, TreePart, division_overlap, divisions
 from mstfilter.mst.segmentation.learned_tree import BorderTree, tree_of_merges
 from mstfilter.mst.segmentation.regions import Regions
 from mstfilter.mst.segmentation.seam_measures import SeamMeasures
@@ -49,6 +49,7 @@ _SURE = -5.0  # most log odds of merges inside a region that is judged to be one
 _LEAST_PIXELS = 400  # of a region that is examined, in an image of 640 x 480
 _MOST_DEPTH = 4  # divisions of a region that follow one another
 _FOLLOWED = -1.5  # log odds of a division above which its sides are examined
+_SAME_DIVISION = 0.7  # overlap from which the most probable division is that of the base tree
 _MOST_MERGES = 8  # of the base tree that are examined in a region
 _SHARES = 200  # values of the share of "one"
 _RARE = 1e-12  # least probability of one object, and of several
@@ -263,8 +264,13 @@ class _Examination:
         merge = self.base.merge_of(node)
         assert merge is not None
         a, b, odds = merge
-        if node in self.clear and self.judged[node].side is not None:
-            odds = self.prior.log_odds(self.judged[node].log_odds)
+        judged = self.judged.get(node)
+        if judged is not None and judged.side is not None:
+            pixels, parts = self.regions[node]
+            own = self.base.regions_of(a)[self.flat[pixels]]
+            if division_overlap(own, judged.side) < _SAME_DIVISION:
+                return self._examined(node, pixels, parts, judged, depth=0)
+            odds = self.prior.log_odds(judged.log_odds)
         return self._join(self._upper(a), self._upper(b), odds)
 
     def _examined(

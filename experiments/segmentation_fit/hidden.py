@@ -1,0 +1,166 @@
+"""Fit the joins of segments that something nearer divides, `models/hidden/weights.json`, on simulated scenes.
+
+    python experiments/segmentation_fit/hidden.py
+    python experiments/segmentation_fit/hidden.py --pairs FOLDER        # keeps the measured pairs; resumable
+    python experiments/segmentation_fit/hidden.py --smoke --out FOLDER  # few images: a quick test
+
+A pair is labelled by the objects that most pixels of its segments have. No real frame is used in the fit. Real frames
+are the label images of HOTS and OSD in MSTFILTER_SHARED (default ../shared), and are scored only. results/hidden.csv
+has the scores: in simulation those of scenes that a fold was not fitted to.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from scenes import Pause, pauses, small
+from scipy.optimize import minimize
+from scipy.special import expit
+
+from mstfilter.base.files import read_csv, write_csv
+from mstfilter.base.resources import models_folder
+from mstfilter.lab.simulation import SCENE_FAMILIES
+from mstfilter.mst.segmentation import BorderTree, ColourDepthBoundary, ObjectRule
+from mstfilter.mst.segmentation.hidden import HIDDEN_FEATURES, hidden_pairs, segments_of
+from mstfilter.scene import scene_cache
+
+HERE = Path(__file__).resolve().parent
+REAL = HERE.parent / "real"
+sys.path.append(str(REAL))
+from folds import border_model  # noqa: E402
+from sequences import SHARED, sequences  # noqa: E402
+
+FAMILIES, SEEDS, PUSHES = ("s2", "s3"), range(20, 60), (0,)
+KNOWN = 0.7  # least share of a segment's pixels that have its object
+RIDGE = 1.0
+FOLDS = 5  # of simulated scenes
+COLUMNS = ("source", "scene", "different", *HIDDEN_FEATURES)
+REAL_SOURCES = ("osd", "hots")
+Rows = list[dict[str, object]]
+
+
+def pairs_of(pause: Pause, tree: BorderTree) -> Iterator[tuple[float, ...]]:
+    """Whether each pair of an image is different objects, and its features."""
+    found = ObjectRule().foreground(pause.frame, pause.grid)
+    regions = tree.regions(ColourDepthBoundary().boundary(found.frame), found.frame, found.pixels)
+    _, image, sums, _ = segments_of(tree.merges(regions), regions)
+    known = pause.image >= 0
+    votes = np.zeros((len(sums), int(pause.image.max()) + 1))
+    np.add.at(votes, (image[known], pause.image[known]), 1)
+    main, share = votes.argmax(axis=1), votes.max(axis=1) / np.maximum(votes.sum(axis=1), 1)
+    for (a, b), row in zip(*hidden_pairs(image, sums, found.frame), strict=True):
+        if min(main[a], main[b]) > 0 and min(share[a], share[b]) > KNOWN:
+            yield int(main[a] != main[b]), *row.round(5).tolist()
+
+
+def images(source: str, smoke: bool) -> Iterator[tuple[str, Pause, BorderTree]]:
+    """The labelled images of a source with their scenes, and the tree for each."""
+    if source.startswith("seed "):
+        for name in FAMILIES if not smoke else ("s2",):
+            family = SCENE_FAMILIES[name] if not smoke else small(SCENE_FAMILIES[name])
+            for pause in pauses(family, int(source[5:]), PUSHES if not smoke else (0,)):
+                yield f"{name} {source}", pause, BorderTree(joins="")
+    else:
+        for sequence in sequences(SHARED):
+            if sequence.source == source:
+                tree = BorderTree(weights=border_model(sequence.name), joins="")
+                for clip in sequence.recording.clips():
+                    yield sequence.name, Pause(clip.after, sequence.truth(clip.index).labels, clip.grid), tree
+
+
+def collected(folder: Path | None, smoke: bool) -> Rows:
+    """The pairs of all images: source, scene, whether they are different objects, features."""
+    rows: Rows = []
+    seeds = [f"seed {seed}" for seed in (SEEDS if not smoke else SEEDS[:2])]
+    for source in [*(() if smoke else REAL_SOURCES), *seeds]:
+        file = None if folder is None else folder / f"{source.replace(' ', '-')}.csv"
+        if file is None or not file.exists():
+            name = "simulated" if source in seeds else source
+            own = [
+                dict(zip(COLUMNS, (name, scene, *row), strict=True))
+                for scene, pause, tree in images(source, smoke)
+                for row in pairs_of(pause, tree)
+            ]
+            scene_cache.clear()
+            if file is not None:
+                file.parent.mkdir(parents=True, exist_ok=True)
+                write_csv(file, own, COLUMNS)
+        else:
+            own = [dict(row) for row in read_csv(file)]
+        rows += own
+        print(time.strftime("%H:%M:%S"), source, len(own), "pairs", flush=True)
+    return rows
+
+
+def fitted(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Ridge logistic regression of y (n,) on x (n, f), of which the first column is 1; features are standardised."""
+    scale = np.append(1.0, x[:, 1:].std(axis=0) + 1e-6)
+    z = x / scale
+
+    def loss(w: np.ndarray) -> tuple[float, np.ndarray]:
+        odds = z @ w
+        value = np.logaddexp(0, odds).sum() - odds @ y + RIDGE / 2 * (w[1:] ** 2).sum()
+        return float(value), z.T @ (expit(odds) - y) + RIDGE * np.append(0.0, w[1:])
+
+    return np.asarray(minimize(loss, np.zeros(x.shape[1]), jac=True).x / scale)
+
+
+def scores(odds: np.ndarray, different: np.ndarray) -> dict[str, float]:
+    """Counts, log loss, and the joins at even odds."""
+    joined = odds < 0
+    p = np.clip(expit(odds), 1e-3, 1 - 1e-3)
+    share = np.clip(different.mean(), 1e-3, 1 - 1e-3)
+    return {
+        "pairs": len(odds),
+        "one object": int((1 - different).sum()),
+        "joined": int(joined.sum()),
+        "joined rightly": int((joined & (different == 0)).sum()),
+        "log loss": round(float(-np.log(np.where(different == 1, p, 1 - p)).mean()), 4),
+        "log loss of the share": round(float(-(share * np.log(share) + (1 - share) * np.log(1 - share))), 4),
+    }
+
+
+def main(options: argparse.Namespace) -> None:
+    """Collect, fit, score and write."""
+    rows = collected(options.pairs, options.smoke)
+    source, scene = (np.array([row[name] for row in rows]) for name in COLUMNS[:2])
+    y, *columns = (np.array([row[name] for row in rows], float) for name in COLUMNS[2:])
+    x = np.column_stack(columns)
+    simulated = source == "simulated"
+    weights = fitted(x[simulated], y[simulated])
+    odds = x @ weights
+    names, number = np.unique(scene[simulated], return_inverse=True)
+    fold = np.random.default_rng(0).permutation(len(names))[number] % FOLDS
+    for k in range(FOLDS):
+        own = np.flatnonzero(simulated)[fold == k]
+        odds[own] = x[own] @ fitted(x[simulated][fold != k], y[simulated][fold != k])
+    table = []
+    for name in ("simulated", "hots", "osd"):
+        if (of := source == name).any():
+            table.append({"images": name} | scores(odds[of], y[of]))
+    options.out.mkdir(parents=True, exist_ok=True)
+    write_csv(options.out / "hidden.csv", table)
+    for row in table:
+        print(row)
+    found = {name: float(f"{value:.4g}") for name, value in zip(HIDDEN_FEATURES, weights, strict=True)}
+    where = options.out if options.smoke else options.weights.parent
+    where.mkdir(parents=True, exist_ok=True)
+    (where / "weights.json").write_text(json.dumps(found, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--pairs", type=Path, help="folder for the measured pairs")
+    parser.add_argument("--weights", type=Path, default=models_folder() / "hidden" / "weights.json")
+    parser.add_argument("--smoke", action="store_true", help="two small scenes; needs --out")
+    parser.add_argument("--out", type=Path, default=HERE / "results")
+    chosen = parser.parse_args()
+    if chosen.smoke and chosen.out == parser.get_default("out"):
+        parser.error("--smoke would overwrite the results: name another folder with --out")
+    main(chosen)

@@ -1,0 +1,284 @@
+"""One object on both sides of another: joins of segments that do not touch in the image.
+
+A cup in front of a box can divide what is seen of the box into two segments without a common border, so a tree of
+merges has no node for the box. The two belong together if what lies between them is hidden by something nearer, and
+if surfaces, colours and heights agree. `hidden_pairs` finds the pairs of segments that are divided in this way and
+measures them. `HiddenJoins` gives the log odds that the two are different objects, and adds a node for each pair that
+may be one object to the merges of a tree:
+
+>>> merges = BorderTree().merges(regions)
+>>> merges = HiddenJoins().added(merges, regions, frame)
+
+The log odds are a logistic regression on `HIDDEN_FEATURES`, fitted to simulated scenes
+(``experiments/segmentation_fit/hidden.py``).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from mstfilter.base.reading import read_json
+from mstfilter.base.resources import models_folder
+from mstfilter.base.trained import load_once
+from mstfilter.mst.segmentation.boundary import filled_disparity
+from mstfilter.mst.segmentation.learned_tree import FEATURES, NO_BORDER, Merge, PairMeasures, check_weights
+from mstfilter.mst.segmentation.regions import Regions
+from mstfilter.scene import Frame, posed_camera, scaled_area, scaled_length
+
+_STEP = 4.0  # sensor units of disparity: something this much nearer hides what is behind it
+_NEARER = 2.0  # sensor units: a pixel between two segments hides what is there if it is this much nearer than both
+_REACH = 4  # pixels on both sides of a border between which its step is measured, in an image 640 wide
+_LEAST_PIXELS = 200  # of a segment, in an image of 640 x 480
+_LEAST_OUTLINE = 6  # pixels of a segment's outline that something nearer hides
+_LINES, _SAMPLES = 60, 24  # lines across a gap from each side, and pixels of a line that are looked at
+_HIDDEN = 0.8  # share of its pixels from which a line is hidden
+_LEAST_HIDDEN = 0.4  # share of the lines of a pair
+_MOST_GAP = 0.35  # metres
+_MOST_ODDS = 4.0  # log odds of different objects: less probable pairs get no node
+_FIT = "python experiments/segmentation_fit/hidden.py"
+
+
+@dataclass(frozen=True, eq=False)
+class Gaps:
+    """Measurements of k pairs of segments and of what lies between them."""
+
+    pair: PairMeasures
+    hidden: np.ndarray  #: (k,) share of the lines across the gap that are hidden
+    width: np.ndarray  #: (k,) metres
+    outlines: np.ndarray  #: (k, 2) numbers of outline pixels that face the gap
+
+
+def _relative(gaps: Gaps) -> np.ndarray:
+    extent = np.minimum(gaps.pair.front.extent, gaps.pair.back.extent)
+    return np.asarray(np.minimum(gaps.width / (extent + 0.01), 4))
+
+
+def _of_pair(name: str) -> Callable[[Gaps], np.ndarray]:
+    return lambda gaps: FEATURES[name](gaps.pair)
+
+
+_COMMON = ("lightness", "chroma", "texture", "misfit", "residual", "log pixels", "log ratio", "centre gap")
+
+#: Features of pairs by name, (k,) each; the first ones are those of pairs that touch.
+HIDDEN_FEATURES: Mapping[str, Callable[[Gaps], np.ndarray]] = {
+    "bias": lambda gaps: np.ones(len(gaps.width)),
+    **{name: _of_pair(name) for name in (*_COMMON, "ground distance")},
+    "height": lambda gaps: np.abs(gaps.pair.higher),
+    "hidden": lambda gaps: gaps.hidden,
+    "gap": lambda gaps: gaps.width * 10,
+    "relative gap": _relative,
+    "outlines": lambda gaps: np.abs(np.log(gaps.outlines[:, 0] / gaps.outlines[:, 1])),
+}
+
+
+def hidden_pairs(segments: np.ndarray, sums: np.ndarray, frame: Frame) -> tuple[list[tuple[int, int]], np.ndarray]:
+    """The pairs of segments that something nearer divides, and their features (k, `HIDDEN_FEATURES`).
+
+    `segments` (H, W) int has the segment of every pixel, and 0 for the table; `sums` (S, C) the row of each segment
+    (`Regions.sums`). Segments with a common border are no pairs.
+    """
+    width = segments.shape[1]
+    disparity = filled_disparity(frame)
+    outline = _hidden_outline(segments, disparity)
+    sizes = np.bincount(segments.ravel(), minlength=len(sums))
+    touching = _touching(segments)
+    own = {
+        k: outline[k]
+        for k in outline
+        if len(outline[k]) >= _LEAST_OUTLINE and sizes[k] >= scaled_area(_LEAST_PIXELS, segments.size)
+    }
+    points = posed_camera(frame).unproject(frame.depth)
+    pairs, rows = [], []
+    for a in sorted(own):
+        for b in sorted(own):
+            if a < b and (a, b) not in touching:
+                found = _across(a, b, own[a], own[b], segments, disparity, points)
+                if found is not None:
+                    pairs.append((a, b))
+                    rows.append(found)
+    if not pairs:
+        return [], np.zeros((0, len(HIDDEN_FEATURES)))
+    first, second = np.array(pairs).T
+    none = np.broadcast_to(NO_BORDER, (len(pairs), len(NO_BORDER)))
+    measured = PairMeasures(sums[first], sums[second], none, none, none, scaled_length(1, width))
+    hidden, gap, *outlines = np.array(rows).T
+    gaps = Gaps(measured, hidden, gap, np.column_stack(outlines))
+    return pairs, np.column_stack([feature(gaps) for feature in HIDDEN_FEATURES.values()])
+
+
+def _shifts(size: int, axis: int, image: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, int]]:
+    """Neighbouring pixels along an axis: the values of both, and the sign of the direction."""
+    last = image.shape[axis] - size
+    low, high = np.take(image, np.arange(last), axis), np.take(image, np.arange(size, last + size), axis)
+    yield low, high, 0
+    yield high, low, size
+
+
+def _hidden_outline(segments: np.ndarray, disparity: np.ndarray) -> dict[int, np.ndarray]:
+    """The pixels (n, 2) of each segment at which another, nearer segment begins."""
+    reach = max(1, round(scaled_length(_REACH, segments.shape[1])))
+    found: list[np.ndarray] = []
+    for axis in (0, 1):
+        for (mine, other, shift), (d_mine, d_other, _) in zip(
+            _shifts(reach, axis, segments), _shifts(reach, axis, disparity), strict=True
+        ):
+            at = np.argwhere((mine > 0) & (other > 0) & (mine != other) & (d_other - d_mine > _STEP))
+            at[:, axis] += shift
+            found.append(at)
+    at = np.unique(np.concatenate(found), axis=0)
+    which = segments[at[:, 0], at[:, 1]]
+    return {int(k): at[which == k] for k in np.unique(which)}
+
+
+def _touching(segments: np.ndarray) -> set[tuple[int, int]]:
+    """The pairs of segments, the lower number first, with a common border."""
+    pairs = np.concatenate(
+        [
+            np.column_stack([segments[:, :-1].ravel(), segments[:, 1:].ravel()]),
+            np.column_stack([segments[:-1].ravel(), segments[1:].ravel()]),
+        ]
+    )
+    pairs = np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0)
+    return {(int(a), int(b)) for a, b in pairs}
+
+
+def _across(
+    a: int,
+    b: int,
+    outline_a: np.ndarray,
+    outline_b: np.ndarray,
+    segments: np.ndarray,
+    disparity: np.ndarray,
+    points: np.ndarray,
+) -> tuple[float, float, int, int] | None:
+    """What lies between two segments: share of hidden lines, width in metres, numbers of outline pixels.
+
+    A line goes from a pixel of one outline to the nearest of the other. None if too few of the lines are hidden.
+    """
+    starts, ends = [], []
+    for one, other in ((outline_a, outline_b), (outline_b, outline_a)):
+        some = one[np.linspace(0, len(one) - 1, min(len(one), _LINES)).astype(int)]
+        starts.append(some)
+        ends.append(other[cKDTree(other).query(some)[1]])
+    start, end = np.concatenate(starts), np.concatenate(ends)
+    t = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+    at = np.rint(start[:, None] + t[:, None] * (end - start)[:, None]).astype(int)
+    rows, columns = at[..., 0], at[..., 1]
+    on = segments[rows, columns]
+    between = (on != a) & (on != b)
+    from_a, from_b = (disparity[one[:, 0], one[:, 1]] for one in (start, end))
+    nearer = disparity[rows, columns] > np.maximum(from_a, from_b)[:, None] + _NEARER
+    share = (between & nearer).sum(axis=1) / np.maximum(between.sum(axis=1), 1)
+    hidden = (share > _HIDDEN) & between.any(axis=1)
+    if hidden.mean() < _LEAST_HIDDEN:
+        return None
+    gaps = np.linalg.norm(points[start[hidden, 0], start[hidden, 1]] - points[end[hidden, 0], end[hidden, 1]], axis=1)
+    gaps = gaps[np.isfinite(gaps)]
+    if not len(gaps) or (gap := float(np.median(gaps))) > _MOST_GAP:
+        return None
+    return float(hidden.mean()), gap, len(outline_a), len(outline_b)
+
+
+@dataclass(frozen=True)
+class HiddenJoins:
+    """Adds nodes for pairs of segments that something nearer divides to the merges of a tree.
+
+    Parameters
+    ----------
+    weights : str
+        Name of a model of the package, or the path of a JSON file with one weight for each of `HIDDEN_FEATURES`.
+    """
+
+    weights: str = "hidden"
+
+    @property
+    def key(self) -> str:
+        """Hash of the weights."""
+        return read_hidden_weights(self.weights)[1]
+
+    def added(self, merges: Sequence[Merge], regions: Regions, frame: Frame) -> list[Merge]:
+        """The merges of a tree (`MergedTree.merges`) with a node for each pair that may be one object.
+
+        Merges of segments keep their order and log odds. A join comes before the first merge with larger log odds.
+        """
+        weights, _ = read_hidden_weights(self.weights)
+        inside, image, sums, nodes = segments_of(merges, regions)
+        pairs, features = hidden_pairs(image, sums, frame)
+        odds = features @ np.array([weights[name] for name in HIDDEN_FEATURES])
+        joins = sorted(
+            (float(value), nodes[a], nodes[b])
+            for value, (a, b) in zip(odds, pairs, strict=True)
+            if value < _MOST_ODDS
+        )
+        return _with_joins(merges, len(regions.sums), inside, joins)
+
+
+def segments_of(merges: Sequence[Merge], regions: Regions) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[int]]:
+    """The most probable segments: the largest nodes of a tree in which no merge joins different objects.
+
+    Returns whether each merge (m,) is inside a segment, the segment (H, W) of every pixel with 0 for the table, the
+    rows (S, C) of the segments (`Regions.sums`), and the node of each.
+    """
+    n = len(regions.sums)
+    inside = np.zeros(len(merges), bool)
+    rows = np.concatenate([regions.sums, np.zeros((len(merges), regions.sums.shape[1]))])
+    for k, (a, b, odds) in enumerate(merges):
+        inside[k] = odds <= 0 and all(one < n or inside[one - n] for one in (a, b))
+        rows[n + k] = rows[a] + rows[b]
+    top = np.arange(n + len(merges))
+    for k in reversed(range(len(merges))):
+        if inside[k]:
+            top[list(merges[k][:2])] = top[n + k]
+    nodes, segment = np.unique(top[1:n], return_inverse=True)
+    number = np.concatenate([[0], segment + 1])
+    sums = np.concatenate([rows[:1], rows[nodes]])
+    return inside, number[regions.image], sums, [0, *nodes.tolist()]
+
+
+def _with_joins(
+    merges: Sequence[Merge], n: int, inside: np.ndarray, joins: Sequence[tuple[float, int, int]]
+) -> list[Merge]:
+    """The merges with joins (log odds, node, node) of segments, in ascending order of log odds."""
+    found: list[Merge] = []
+    above: dict[int, int] = {}  # the merge of a node of the new tree
+
+    def join(a: int, b: int, odds: float) -> int:
+        a, b = (_last(above, node) for node in (a, b))
+        if a == b:
+            return a
+        above[a] = above[b] = new = n + len(found)
+        found.append((a, b, odds))
+        return new
+
+    node = list(range(n))  # of the new tree, of each old one
+    waiting = list(reversed(joins))
+    for k, (a, b, odds) in enumerate(merges):
+        while waiting and not inside[k] and waiting[-1][0] < odds:
+            value, first, second = waiting.pop()
+            join(node[first], node[second], value)
+        node.append(join(node[a], node[b], odds))
+    for value, first, second in reversed(waiting):
+        join(node[first], node[second], value)
+    return found
+
+
+def _last(above: Mapping[int, int], node: int) -> int:
+    """The last node over a node."""
+    while node in above:
+        node = above[node]
+    return node
+
+
+@load_once
+def read_hidden_weights(name: str) -> tuple[Mapping[str, float], str]:
+    """Weights of `HIDDEN_FEATURES` by name, and the hash of the file. A file is read again if it has changed."""
+    path = Path(name) if name.endswith(".json") else models_folder() / name / "weights.json"
+    weights = read_json(path, "weights of hidden joins", f"fit them with: {_FIT}")
+    check_weights(weights, HIDDEN_FEATURES, path, _FIT)
+    return weights, hashlib.sha256(path.read_bytes()).hexdigest()[:16]
