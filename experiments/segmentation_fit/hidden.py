@@ -36,7 +36,7 @@ sys.path.append(str(REAL))
 from folds import border_model  # noqa: E402
 from sequences import SHARED, sequences  # noqa: E402
 
-FAMILIES, SEEDS, PUSHES = ("s2", "s3"), range(20, 60), (0,)
+FAMILIES, SEEDS = ("s2", "s3", "row", "occlusion"), range(20, 60)
 KNOWN = 0.7  # least share of a segment's pixels that have its object
 RIDGE = 1.0
 FOLDS = 5  # of simulated scenes
@@ -59,32 +59,32 @@ def pairs_of(pause: Pause, tree: BorderTree) -> Iterator[tuple[float, ...]]:
             yield int(main[a] != main[b]), *row.round(5).tolist()
 
 
-def images(source: str, smoke: bool) -> Iterator[tuple[str, Pause, BorderTree]]:
-    """The labelled images of a source with their scenes, and the tree for each."""
-    if source.startswith("seed "):
-        for name in FAMILIES if not smoke else ("s2",):
-            family = SCENE_FAMILIES[name] if not smoke else small(SCENE_FAMILIES[name])
-            for pause in pauses(family, int(source[5:]), PUSHES if not smoke else (0,)):
-                yield f"{name} {source}", pause, BorderTree(joins="")
-    else:
+def images(source: str, smoke: bool) -> Iterator[tuple[Pause, BorderTree, str]]:
+    """The labelled images of a scene, or of a real source, each with the tree and the name of the scene."""
+    if source in REAL_SOURCES:
         for sequence in sequences(SHARED):
             if sequence.source == source:
                 tree = BorderTree(weights=border_model(sequence.name), joins="")
                 for clip in sequence.recording.clips():
-                    yield sequence.name, Pause(clip.after, sequence.truth(clip.index).labels, clip.grid), tree
+                    yield Pause(clip.after, sequence.truth(clip.index).labels, clip.grid), tree, sequence.name
+        return
+    name, seed = source.split()
+    family = SCENE_FAMILIES[name] if not smoke else small(SCENE_FAMILIES[name])
+    for pause in pauses(family, int(seed)):
+        yield pause, BorderTree(joins=""), source
 
 
 def collected(folder: Path | None, smoke: bool) -> Rows:
     """The pairs of all images: source, scene, whether they are different objects, features."""
     rows: Rows = []
-    seeds = [f"seed {seed}" for seed in (SEEDS if not smoke else SEEDS[:2])]
-    for source in [*(() if smoke else REAL_SOURCES), *seeds]:
+    scenes = [f"{name} {seed}" for seed in SEEDS for name in FAMILIES] if not smoke else ["s2 20", "s2 21"]
+    for source in [*(() if smoke else REAL_SOURCES), *scenes]:
         file = None if folder is None else folder / f"{source.replace(' ', '-')}.csv"
         if file is None or not file.exists():
-            name = "simulated" if source in seeds else source
+            name = "simulated" if source in scenes else source
             own = [
                 dict(zip(COLUMNS, (name, scene, *row), strict=True))
-                for scene, pause, tree in images(source, smoke)
+                for pause, tree, scene in images(source, smoke)
                 for row in pairs_of(pause, tree)
             ]
             scene_cache.clear()

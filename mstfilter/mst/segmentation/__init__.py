@@ -16,6 +16,7 @@ does all this and completes the segments to 3-D shapes.
 `regions`         measurements of regions and of their borders
 `learned_tree`    trees from learned log odds
 `border_network`  the trained network that corrects these log odds
+`hidden`          joins of segments on both sides of something nearer
 `divisions`       ways to divide a region, which a tree of borders may not contain
 `seam_measures`   what is measured of a division
 `seam_network`    the judge: one object, or two that touch?

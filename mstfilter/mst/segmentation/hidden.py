@@ -16,7 +16,7 @@ The log odds are a logistic regression on `HIDDEN_FEATURES`, fitted to simulated
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,11 +33,12 @@ from mstfilter.scene import Frame, posed_camera, scaled_area, scaled_length
 
 _STEP = 4.0  # sensor units of disparity: something this much nearer hides what is behind it
 _NEARER = 2.0  # sensor units: a pixel between two segments hides what is there if it is this much nearer than both
-_REACH = 4  # pixels on both sides of a border between which its step is measured, in an image 640 wide
+_REACH = 2  # pixels on both sides of a border between which its step is measured, in an image 640 wide
+_SHADOW = 40  # pixels without readings that there can be beside something nearer, in an image 640 wide
 _LEAST_PIXELS = 200  # of a segment, in an image of 640 x 480
 _LEAST_OUTLINE = 6  # pixels of a segment's outline that something nearer hides
 _LINES, _SAMPLES = 60, 24  # lines across a gap from each side, and pixels of a line that are looked at
-_HIDDEN = 0.8  # share of its pixels from which a line is hidden
+_HIDDEN, _NEAR = 0.8, 0.3  # least share of the readings and of the pixels of a hidden line that are nearer
 _LEAST_HIDDEN = 0.4  # share of the lines of a pair
 _MOST_GAP = 0.35  # metres
 _MOST_ODDS = 4.0  # log odds of different objects: less probable pairs get no node
@@ -84,8 +85,8 @@ def hidden_pairs(segments: np.ndarray, sums: np.ndarray, frame: Frame) -> tuple[
     (`Regions.sums`). Segments with a common border are no pairs.
     """
     width = segments.shape[1]
-    disparity = filled_disparity(frame)
-    outline = _hidden_outline(segments, disparity)
+    disparity, shadow = filled_disparity(frame), ~frame.valid & (segments == 0)
+    outline = _hidden_outline(segments, disparity, shadow)
     sizes = np.bincount(segments.ravel(), minlength=len(sums))
     touching = _touching(segments)
     own = {
@@ -98,7 +99,7 @@ def hidden_pairs(segments: np.ndarray, sums: np.ndarray, frame: Frame) -> tuple[
     for a in sorted(own):
         for b in sorted(own):
             if a < b and (a, b) not in touching:
-                found = _across(a, b, own[a], own[b], segments, disparity, points)
+                found = _across(a, b, own[a], own[b], segments, disparity, shadow, points)
                 if found is not None:
                     pairs.append((a, b))
                     rows.append(found)
@@ -112,28 +113,39 @@ def hidden_pairs(segments: np.ndarray, sums: np.ndarray, frame: Frame) -> tuple[
     return pairs, np.column_stack([feature(gaps) for feature in HIDDEN_FEATURES.values()])
 
 
-def _shifts(size: int, axis: int, image: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, int]]:
-    """Neighbouring pixels along an axis: the values of both, and the sign of the direction."""
-    last = image.shape[axis] - size
-    low, high = np.take(image, np.arange(last), axis), np.take(image, np.arange(size, last + size), axis)
-    yield low, high, 0
-    yield high, low, size
+def _hidden_outline(segments: np.ndarray, disparity: np.ndarray, shadow: np.ndarray) -> dict[int, np.ndarray]:
+    """The pixels (n, 2) of each segment at which another, nearer segment begins.
 
-
-def _hidden_outline(segments: np.ndarray, disparity: np.ndarray) -> dict[int, np.ndarray]:
-    """The pixels (n, 2) of each segment at which another, nearer segment begins."""
-    reach = max(1, round(scaled_length(_REACH, segments.shape[1])))
-    found: list[np.ndarray] = []
-    for axis in (0, 1):
-        for (mine, other, shift), (d_mine, d_other, _) in zip(
-            _shifts(reach, axis, segments), _shifts(reach, axis, disparity), strict=True
-        ):
-            at = np.argwhere((mine > 0) & (other > 0) & (mine != other) & (d_other - d_mine > _STEP))
-            at[:, axis] += shift
-            found.append(at)
+    Between the two there can be a `shadow` (H, W) bool: pixels without readings, which are beside something near.
+    """
+    width = segments.shape[1]
+    reach, most = (max(1, round(scaled_length(n, width))) for n in (_REACH, _SHADOW))
+    found = []
+    for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
+        # All directions are that of ascending columns of the turned images.
+        own, d, dark = (_turned(image, axis, step) for image in (segments, disparity, shadow))
+        columns = np.arange(own.shape[1])
+        after = np.where(dark, own.shape[1], columns)[:, ::-1]
+        after = np.minimum.accumulate(after, axis=1)[:, ::-1]  # the first pixel from here on that is not dark
+        after = np.append(after[:, 1:], np.full((len(own), 1), own.shape[1]), axis=1)
+        row, column = np.nonzero((own > 0) & (after <= columns + most) & (after < own.shape[1]))
+        other = after[row, column]
+        differs = (own[row, other] > 0) & (own[row, other] != own[row, column])
+        row, column, other = row[differs], column[differs], other[differs]
+        inside = np.minimum(other + reach, own.shape[1] - 1)
+        nearer = d[row, inside] - d[row, np.maximum(column - reach, 0)] > _STEP
+        row, column = row[nearer], column[nearer]
+        column = column if step > 0 else own.shape[1] - 1 - column
+        found.append(np.column_stack([row, column] if axis else [column, row]))
     at = np.unique(np.concatenate(found), axis=0)
     which = segments[at[:, 0], at[:, 1]]
     return {int(k): at[which == k] for k in np.unique(which)}
+
+
+def _turned(image: np.ndarray, axis: int, step: int) -> np.ndarray:
+    """An image (H, W) whose columns ascend in a direction along an axis."""
+    image = image if axis else image.T
+    return image if step > 0 else image[:, ::-1]
 
 
 def _touching(segments: np.ndarray) -> set[tuple[int, int]]:
@@ -155,6 +167,7 @@ def _across(
     outline_b: np.ndarray,
     segments: np.ndarray,
     disparity: np.ndarray,
+    shadow: np.ndarray,
     points: np.ndarray,
 ) -> tuple[float, float, int, int] | None:
     """What lies between two segments: share of hidden lines, width in metres, numbers of outline pixels.
@@ -174,8 +187,9 @@ def _across(
     between = (on != a) & (on != b)
     from_a, from_b = (disparity[one[:, 0], one[:, 1]] for one in (start, end))
     nearer = disparity[rows, columns] > np.maximum(from_a, from_b)[:, None] + _NEARER
-    share = (between & nearer).sum(axis=1) / np.maximum(between.sum(axis=1), 1)
-    hidden = (share > _HIDDEN) & between.any(axis=1)
+    nearer &= between
+    read = (between & ~shadow[rows, columns]).sum(axis=1)
+    hidden = (nearer.sum(axis=1) > _HIDDEN * read) & (nearer.sum(axis=1) > _NEAR * between.sum(axis=1))
     if hidden.mean() < _LEAST_HIDDEN:
         return None
     gaps = np.linalg.norm(points[start[hidden, 0], start[hidden, 1]] - points[end[hidden, 0], end[hidden, 1]], axis=1)
