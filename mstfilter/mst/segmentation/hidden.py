@@ -2,35 +2,36 @@
 
 A cup in front of a box can divide what is seen of the box into two segments without a common border, so a tree of
 merges has no node for the box. The two belong together if what lies between them is hidden by something nearer, and
-if surfaces, colours and heights agree. `hidden_pairs` finds the pairs of segments that are divided in this way and
-measures them. `HiddenJoins` gives the log odds that the two are different objects, and adds a node for each pair that
-may be one object to the merges of a tree:
+if surfaces, heights and colours agree. `hidden_pairs` finds the pairs of segments that are divided in this way and
+measures how much they disagree. `with_joins` adds a node for each pair that may be one object to the merges of a
+tree:
 
 >>> merges = BorderTree().merges(regions)
->>> merges = HiddenJoins().added(merges, regions, frame)
+>>> merges = with_joins(merges, regions, frame)
 
-The log odds are a logistic regression on `HIDDEN_FEATURES`, fitted to simulated scenes
-(``experiments/segmentation_fit/hidden.py``).
+The log odds that the two are different objects are a linear function of the disagreement, which was fitted to
+simulated and real images (``experiments/segmentation_fit/hidden.py``).
 """
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mstfilter.base.reading import read_json
-from mstfilter.base.resources import models_folder
-from mstfilter.base.trained import load_once
 from mstfilter.mst.segmentation.boundary import filled_disparity
-from mstfilter.mst.segmentation.learned_tree import FEATURES, NO_BORDER, Merge, PairMeasures, check_weights
+from mstfilter.mst.segmentation.learned_tree import NO_BORDER, Merge, PairMeasures
 from mstfilter.mst.segmentation.regions import Regions
 from mstfilter.scene import Frame, posed_camera, scaled_area, scaled_length
 
+#: What the disagreement of a pair is: the largest of these measurements, each in units of the number here. The misfit
+#: of one quadric surface to both segments, the difference of their heights in units of 10 cm, and the Bhattacharyya
+#: distance of their colours.
+DISAGREEMENT = {"misfit": 3.0, "height": 0.45, "texture": 0.9}
+#: Log odds of different objects: slope times (disagreement - even).
+SLOPE, EVEN = 3.0, 1.07
+_MOST_DISAGREEMENT = 3.0
 _STEP = 4.0  # sensor units of disparity: something this much nearer hides what is behind it
 _NEARER = 2.0  # sensor units: a pixel between two segments hides what is there if it is this much nearer than both
 _REACH = 2  # pixels on both sides of a border between which its step is measured, in an image 640 wide
@@ -42,44 +43,10 @@ _HIDDEN, _NEAR = 0.8, 0.3  # least share of the readings and of the pixels of a 
 _LEAST_HIDDEN = 0.4  # share of the lines of a pair
 _MOST_GAP = 0.35  # metres
 _MOST_ODDS = 4.0  # log odds of different objects: less probable pairs get no node
-_FIT = "python experiments/segmentation_fit/hidden.py"
-
-
-@dataclass(frozen=True, eq=False)
-class Gaps:
-    """Measurements of k pairs of segments and of what lies between them."""
-
-    pair: PairMeasures
-    hidden: np.ndarray  #: (k,) share of the lines across the gap that are hidden
-    width: np.ndarray  #: (k,) metres
-    outlines: np.ndarray  #: (k, 2) numbers of outline pixels that face the gap
-
-
-def _relative(gaps: Gaps) -> np.ndarray:
-    extent = np.minimum(gaps.pair.front.extent, gaps.pair.back.extent)
-    return np.asarray(np.minimum(gaps.width / (extent + 0.01), 4))
-
-
-def _of_pair(name: str) -> Callable[[Gaps], np.ndarray]:
-    return lambda gaps: FEATURES[name](gaps.pair)
-
-
-_COMMON = ("lightness", "chroma", "texture", "misfit", "residual", "log pixels", "log ratio", "centre gap")
-
-#: Features of pairs by name, (k,) each; the first ones are those of pairs that touch.
-HIDDEN_FEATURES: Mapping[str, Callable[[Gaps], np.ndarray]] = {
-    "bias": lambda gaps: np.ones(len(gaps.width)),
-    **{name: _of_pair(name) for name in (*_COMMON, "ground distance")},
-    "height": lambda gaps: np.abs(gaps.pair.higher),
-    "hidden": lambda gaps: gaps.hidden,
-    "gap": lambda gaps: gaps.width * 10,
-    "relative gap": _relative,
-    "outlines": lambda gaps: np.abs(np.log(gaps.outlines[:, 0] / gaps.outlines[:, 1])),
-}
 
 
 def hidden_pairs(segments: np.ndarray, sums: np.ndarray, frame: Frame) -> tuple[list[tuple[int, int]], np.ndarray]:
-    """The pairs of segments that something nearer divides, and their features (k, `HIDDEN_FEATURES`).
+    """The pairs of segments that something nearer divides, and how they disagree (k, `DISAGREEMENT`), 0 .. 3.
 
     `segments` (H, W) int has the segment of every pixel, and 0 for the table; `sums` (S, C) the row of each segment
     (`Regions.sums`). Segments with a common border are no pairs.
@@ -95,22 +62,18 @@ def hidden_pairs(segments: np.ndarray, sums: np.ndarray, frame: Frame) -> tuple[
         if len(outline[k]) >= _LEAST_OUTLINE and sizes[k] >= scaled_area(_LEAST_PIXELS, segments.size)
     }
     points = posed_camera(frame).unproject(frame.depth)
-    pairs, rows = [], []
-    for a in sorted(own):
-        for b in sorted(own):
-            if a < b and (a, b) not in touching:
-                found = _across(a, b, own[a], own[b], segments, disparity, shadow, points)
-                if found is not None:
-                    pairs.append((a, b))
-                    rows.append(found)
-    if not pairs:
-        return [], np.zeros((0, len(HIDDEN_FEATURES)))
-    first, second = np.array(pairs).T
+    pairs = [
+        (a, b)
+        for a in sorted(own)
+        for b in sorted(own)
+        if a < b and (a, b) not in touching and _divided(a, b, own[a], own[b], segments, disparity, shadow, points)
+    ]
+    first, second = np.array(pairs, dtype=int).reshape(-1, 2).T
     none = np.broadcast_to(NO_BORDER, (len(pairs), len(NO_BORDER)))
-    measured = PairMeasures(sums[first], sums[second], none, none, none, scaled_length(1, width))
-    hidden, gap, *outlines = np.array(rows).T
-    gaps = Gaps(measured, hidden, gap, np.column_stack(outlines))
-    return pairs, np.column_stack([feature(gaps) for feature in HIDDEN_FEATURES.values()])
+    pair = PairMeasures(sums[first], sums[second], none, none, none, scaled_length(1, width))
+    measured = {"misfit": pair.misfit, "height": np.abs(pair.higher), "texture": pair.texture()}
+    values = np.column_stack([measured[name] / unit for name, unit in DISAGREEMENT.items()])
+    return pairs, np.minimum(values, _MOST_DISAGREEMENT)
 
 
 def _hidden_outline(segments: np.ndarray, disparity: np.ndarray, shadow: np.ndarray) -> dict[int, np.ndarray]:
@@ -160,7 +123,7 @@ def _touching(segments: np.ndarray) -> set[tuple[int, int]]:
     return {(int(a), int(b)) for a, b in pairs}
 
 
-def _across(
+def _divided(
     a: int,
     b: int,
     outline_a: np.ndarray,
@@ -169,10 +132,10 @@ def _across(
     disparity: np.ndarray,
     shadow: np.ndarray,
     points: np.ndarray,
-) -> tuple[float, float, int, int] | None:
-    """What lies between two segments: share of hidden lines, width in metres, numbers of outline pixels.
+) -> bool:
+    """Whether enough of the lines across the gap between two segments are hidden, and the gap is small enough.
 
-    A line goes from a pixel of one outline to the nearest of the other. None if too few of the lines are hidden.
+    A line goes from a pixel of one outline to the nearest of the other.
     """
     starts, ends = [], []
     for one, other in ((outline_a, outline_b), (outline_b, outline_a)):
@@ -191,46 +154,24 @@ def _across(
     read = (between & ~shadow[rows, columns]).sum(axis=1)
     hidden = (nearer.sum(axis=1) > _HIDDEN * read) & (nearer.sum(axis=1) > _NEAR * between.sum(axis=1))
     if hidden.mean() < _LEAST_HIDDEN:
-        return None
+        return False
     gaps = np.linalg.norm(points[start[hidden, 0], start[hidden, 1]] - points[end[hidden, 0], end[hidden, 1]], axis=1)
     gaps = gaps[np.isfinite(gaps)]
-    if not len(gaps) or (gap := float(np.median(gaps))) > _MOST_GAP:
-        return None
-    return float(hidden.mean()), gap, len(outline_a), len(outline_b)
+    return bool(len(gaps)) and float(np.median(gaps)) <= _MOST_GAP
 
 
-@dataclass(frozen=True)
-class HiddenJoins:
-    """Adds nodes for pairs of segments that something nearer divides to the merges of a tree.
+def with_joins(merges: Sequence[Merge], regions: Regions, frame: Frame) -> list[Merge]:
+    """The merges of a tree (`MergedTree.merges`) with a node for each pair of segments that may be one object.
 
-    Parameters
-    ----------
-    weights : str
-        Name of a model of the package, or the path of a JSON file with one weight for each of `HIDDEN_FEATURES`.
+    Merges of segments keep their order and log odds. A join comes before the first merge with larger log odds.
     """
-
-    weights: str = "hidden"
-
-    @property
-    def key(self) -> str:
-        """Hash of the weights."""
-        return read_hidden_weights(self.weights)[1]
-
-    def added(self, merges: Sequence[Merge], regions: Regions, frame: Frame) -> list[Merge]:
-        """The merges of a tree (`MergedTree.merges`) with a node for each pair that may be one object.
-
-        Merges of segments keep their order and log odds. A join comes before the first merge with larger log odds.
-        """
-        weights, _ = read_hidden_weights(self.weights)
-        inside, image, sums, nodes = segments_of(merges, regions)
-        pairs, features = hidden_pairs(image, sums, frame)
-        odds = features @ np.array([weights[name] for name in HIDDEN_FEATURES])
-        joins = sorted(
-            (float(value), nodes[a], nodes[b])
-            for value, (a, b) in zip(odds, pairs, strict=True)
-            if value < _MOST_ODDS
-        )
-        return _with_joins(merges, len(regions.sums), inside, joins)
+    inside, image, sums, nodes = segments_of(merges, regions)
+    pairs, values = hidden_pairs(image, sums, frame)
+    odds = SLOPE * (values.max(axis=1, initial=0.0) - EVEN)
+    joins = sorted(
+        (float(value), nodes[a], nodes[b]) for value, (a, b) in zip(odds, pairs, strict=True) if value < _MOST_ODDS
+    )
+    return _inserted(merges, len(regions.sums), inside, joins)
 
 
 def segments_of(merges: Sequence[Merge], regions: Regions) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[int]]:
@@ -255,7 +196,7 @@ def segments_of(merges: Sequence[Merge], regions: Regions) -> tuple[np.ndarray, 
     return inside, number[regions.image], sums, [0, *nodes.tolist()]
 
 
-def _with_joins(
+def _inserted(
     merges: Sequence[Merge], n: int, inside: np.ndarray, joins: Sequence[tuple[float, int, int]]
 ) -> list[Merge]:
     """The merges with joins (log odds, node, node) of segments, in ascending order of log odds."""
@@ -287,12 +228,3 @@ def _last(above: Mapping[int, int], node: int) -> int:
     while node in above:
         node = above[node]
     return node
-
-
-@load_once
-def read_hidden_weights(name: str) -> tuple[Mapping[str, float], str]:
-    """Weights of `HIDDEN_FEATURES` by name, and the hash of the file. A file is read again if it has changed."""
-    path = Path(name) if name.endswith(".json") else models_folder() / name / "weights.json"
-    weights = read_json(path, "weights of hidden joins", f"fit them with: {_FIT}")
-    check_weights(weights, HIDDEN_FEATURES, path, _FIT)
-    return weights, hashlib.sha256(path.read_bytes()).hexdigest()[:16]

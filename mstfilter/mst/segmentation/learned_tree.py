@@ -44,7 +44,6 @@ from mstfilter.scene import Frame, pixels_above_table, scaled_length
 
 if TYPE_CHECKING:
     from mstfilter.mst.segmentation.border_network import BorderNetwork, PairNetwork
-    from mstfilter.mst.segmentation.hidden import HiddenJoins
 
 #: Log odds (k,) that the regions of k pairs belong to different objects:
 #: (rows of a, rows of b, borders, table borders of a, of b).
@@ -384,17 +383,12 @@ class BorderTree(MergedTree):
         Builds the leaves that are merged.
     weights : str
         Name of a trained model of the package, or the path of a model folder.
-    joins : str
-        Name or JSON file of the weights of `HiddenJoins`: segments on both sides of something nearer can be one
-        object. Empty for no such joins.
+    joins : bool
+        Whether segments on both sides of something nearer can be one object (`mstfilter.mst.segmentation.hidden`).
     """
 
     weights: str = "border"
-    joins: str = "hidden"
-
-    @property
-    def bound_key(self) -> bytes:
-        return super().bound_key + (self._joins().key.encode() if self.joins else b"")
+    joins: bool = True
 
     def model(self) -> tuple[Mapping[str, float], str]:
         network = self._network()
@@ -408,12 +402,9 @@ class BorderTree(MergedTree):
         return self._network().correction
 
     def joined(self, merges: list[Merge], regions: Regions, frame: Frame) -> list[Merge]:
-        return self._joins().added(merges, regions, frame) if self.joins else merges
+        from mstfilter.mst.segmentation.hidden import with_joins
 
-    def _joins(self) -> HiddenJoins:
-        from mstfilter.mst.segmentation.hidden import HiddenJoins
-
-        return HiddenJoins(self.joins)
+        return with_joins(merges, regions, frame) if self.joins else merges
 
     def _network(self) -> BorderNetwork:
         from mstfilter.mst.segmentation.border_network import load_border_network

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
-
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from mstfilter.base.errors import InputError
-from mstfilter.mst.segmentation import BorderTree, ColourDepthBoundary
-from mstfilter.mst.segmentation.hidden import HIDDEN_FEATURES, HiddenJoins, _with_joins, hidden_pairs, segments_of
+from mstfilter.mst.segmentation import BorderTree, ColourDepthBoundary, hidden
+from mstfilter.mst.segmentation.hidden import DISAGREEMENT, _inserted, hidden_pairs, segments_of, with_joins
 from mstfilter.mst.segmentation.regions import REGION, Regions, measure_regions
 from mstfilter.scene import render
 from tests.mst.segmentation.scenes import GRID, boxes, camera, frame_of
@@ -33,21 +30,18 @@ def seen(*corners):
 
 
 def pairs_of(*corners):
-    """The pairs of a scene as pairs of true objects, and their features by name."""
+    """The pairs of a scene as pairs of true objects, and how they disagree by name."""
     frame, truth, segments = seen(*corners)
     sums = measure_regions(segments, frame, ColourDepthBoundary().boundary(frame)).sums
-    pairs, features = hidden_pairs(segments, sums, frame)
-    named = [dict(zip(HIDDEN_FEATURES, row.tolist(), strict=True)) for row in features]
+    pairs, values = hidden_pairs(segments, sums, frame)
+    named = [dict(zip(DISAGREEMENT, row.tolist(), strict=True)) for row in values]
     return [tuple(int(truth[segments == k][0]) for k in pair) for pair in pairs], named
 
 
 def test_a_pole_divides_a_box():
-    pairs, [features] = pairs_of(BOX, POLE)
+    pairs, [found] = pairs_of(BOX, POLE)
     assert pairs == [(1, 1)]
-    assert features["hidden"] > 0.9
-    assert 0.2 < features["gap"] < 0.8  # a pole of 3 cm, 10 cm nearer, hides a little more
-    assert features["lightness"] < 0.1
-    assert features["height"] < 0.2
+    assert max(found.values()) < 0.5
 
 
 def test_what_is_seen_between_two_boxes_is_not_hidden():
@@ -62,36 +56,37 @@ def test_a_box_that_a_pole_does_not_divide_has_no_pair():
 
 def test_two_boxes_behind_a_pole_are_a_pair_that_differs():
     left, right = ((12, 36, 0), (30, 42, 8)), ((30, 38, 0), (48, 44, 14))
-    pairs, [features] = pairs_of(left, right, POLE)
+    pairs, [found] = pairs_of(left, right, POLE)
     assert pairs == [(1, 2)]
-    assert features["height"] > 0.4
-    assert features["chroma"] > 1
+    assert found["height"] == pytest.approx(0.6 / 0.45, abs=0.25)  # 6 cm
+    assert found["texture"] > 2
+    assert found["misfit"] > 0.5
 
 
-def written(folder, **weights):
-    path = folder / "weights.json"
-    path.write_text(json.dumps({name: 0.0 for name in HIDDEN_FEATURES} | weights))
-    return str(path)
-
-
-@pytest.mark.parametrize(("odds", "together"), [(-3.0, True), (9.0, False)])
-def test_a_join_is_a_node_of_the_tree(tmp_path, odds, together):
+@pytest.mark.parametrize(("even", "joined"), [(1.0, True), (-3.0, False)])
+def test_a_join_is_a_node_of_the_tree(monkeypatch, even, joined):
+    monkeypatch.setattr(hidden, "EVEN", even)
     frame, _, segments = seen(BOX, POLE)
     regions = measure_regions(segments, frame, ColourDepthBoundary().boundary(frame))
     merges = [(1, 3, 2.0), (4, 2, 5.0)]  # one side of the box and the pole, then the other side
-    found = HiddenJoins(written(tmp_path, bias=odds)).added(merges, regions, frame)
-    assert found == ([(1, 2, odds), (4, 3, 2.0)] if together else merges)
+    found = with_joins(merges, regions, frame)
+    if joined:
+        [(a, b, odds), last] = found
+        assert (a, b, last) == (1, 2, (4, 3, 2.0))
+        assert -3 < odds < -1
+    else:
+        assert found == merges
 
 
-def test_the_border_tree_has_the_join(tmp_path):
+def test_the_border_tree_has_the_join():
     frame, truth, _ = seen(BOX, POLE)
     boundary = ColourDepthBoundary().boundary(frame)
-    for joins, parts in ((written(tmp_path, bias=-3.0), 1), ("", 2)):
+    for joins in (True, False):
         tree = BorderTree(joins=joins).build(boundary, frame)
         masks = [tree.mask(node) for node in range(tree.n_nodes - 1)]
         box, pole = truth == 1, truth == 2
         whole = [m for m in masks if (m & box).sum() > 0.9 * box.sum() and (m & pole).sum() < 0.1 * pole.sum()]
-        assert bool(whole) == (parts == 1)
+        assert bool(whole) == joins
 
 
 def random_tree(rng, n):
@@ -121,7 +116,7 @@ def test_joins_keep_segments_and_every_region_has_one_way_up(seed):
         for b in range(a + 1, s)
         if rng.uniform() < 0.3
     )
-    found = _with_joins(merges, n, inside, joins)
+    found = _inserted(merges, n, inside, joins)
     below = {k: frozenset([k]) for k in range(n)}
     for k, (a, b, _) in enumerate(found):
         assert not below[a] & below[b]
@@ -136,10 +131,3 @@ def test_joins_keep_segments_and_every_region_has_one_way_up(seed):
         _, a, b = joins[0]
         members = [frozenset(np.flatnonzero(image[0] == nodes.index(one)).tolist()) for one in (a, b)]
         assert any(members[0] <= one and members[1] <= one for one in below.values())
-
-
-def test_weights_must_be_those_of_the_features(tmp_path):
-    path = tmp_path / "weights.json"
-    path.write_text(json.dumps({"bias": 1.0}))
-    with pytest.raises(InputError, match="has no weight of the feature"):
-        _ = HiddenJoins(str(path)).key
