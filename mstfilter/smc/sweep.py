@@ -12,12 +12,13 @@ with 20,000 particles instead of 200 calls with 100: a thirtieth of the time.
 [(2,), (2,), (2,), (2,), (2,)]
 
 A sweep has random streams of its own. Its runs are independent and have the law of single runs, but not their bits.
-`mstfilter.smc.run_many` uses sweeps where it can, and `pmmh` and `ensemble` for filters with different parameters.
+`mstfilter.smc.run_many` uses sweeps where it can, and `pmmh`, `ensemble` and `smc2` for filters with different
+parameters, which `sweep_difference` compares with single ones.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,6 +27,7 @@ import numpy as np
 from mstfilter.base.errors import LostRunError, naming
 from mstfilter.smc.components import Always, EssBelow, Never
 from mstfilter.smc.filter import ParticleFilter, keep_freed_memory
+from mstfilter.smc.first_steps import first_difference, is_numeric
 from mstfilter.smc.history import Collector, by_key, check_one_shape, ess, log_evidence, resampled, stacked
 from mstfilter.smc.inputs import split_input
 from mstfilter.smc.interfaces import Info, State
@@ -42,12 +44,60 @@ class Collected:
     lost: str = ""  #: why the run is lost (all weights are zero); "" if it is not
 
 
+DIFFERENT_WEIGHTS = (
+    "the likelihood with one parameter vector for each particle is not that of single filters",
+    "with batched=True, filter_of gets arrays of one parameter per particle: use them like particles",
+)
+
+
 def can_sweep(filter: ParticleFilter) -> bool:
     """Whether runs of a filter can be swept: its components process each particle alone, and n is constant."""
     if any(getattr(filter, slot) is not None for slot in ("proposal", "rejuvenation")):
         return False
     components = (filter.initial, filter.transition, filter.update, filter.lookahead)
     return filter.resampler.exact_size and all(c is None or c.alone for c in components)
+
+
+def sweep_difference(alone: Sequence[ParticleFilter], both: ParticleFilter, observations: Sequence[Any]) -> str:
+    """Compare a filter with two parameter vectors, one for each half of its particles, with the filter of each.
+
+    In the first two steps, each component is called with the same particles and random numbers. Returns "weights" if
+    weights of particles differ from those of the filter with their parameters, which is an error. Otherwise "draws",
+    if draws differ or are objects: they may have the same law if the numbers that they consume depend on parameters.
+    Otherwise "". Raises what a component raises.
+    """
+    n, found, same_draws = alone[0].n, None, True
+    halves = slice(0, n), slice(n, 2 * n)
+
+    def weights_differ(together: Any, one_by_one: Sequence[Any]) -> bool:
+        wanted = np.concatenate([a[half] for a, half in zip(one_by_one, halves, strict=True)])
+        return not np.allclose(together, wanted, rtol=1e-6, atol=1e-6)
+
+    for t, observation in enumerate(observations[:2]):
+        y, u = split_input(observation)
+        every = [filter.at_step(t, u) for filter in (both, *alone)]
+        if found is None:
+            drawn = [f.initial.sample(Key(t).generator(), y, 2 * n) for f in every]  # type: ignore[union-attr]
+        else:
+            if both.lookahead is not None and y is not None:
+                priorities = [f.lookahead.log_priority(found, y) for f in every]  # type: ignore[union-attr]
+                if weights_differ(priorities[0], priorities[1:]):
+                    return "weights"
+            moves = [f.transition for f in every]
+            drawn = [found if m is None else m.predict(Key(t).generator(), found, y) for m in moves]
+        for one, half in zip(drawn[1:], halves, strict=True):
+            same = first_difference(drawn[0].particles, one.particles, half) is None
+            same_draws = same_draws and same and is_numeric(one.particles)
+        if same_draws and weights_differ(drawn[0].log_weights, [one.log_weights for one in drawn[1:]]):
+            return "weights"
+        found = drawn[0]
+        if y is not None and both.update is not None:
+            rng = Key(t).generator()
+            updated = [f.update.update(rng, found, None, y) for f in every]  # type: ignore[union-attr]
+            if weights_differ(updated[0].log_weights, [one.log_weights for one in updated[1:]]):
+                return "weights"
+            found = updated[0]
+    return "" if same_draws else "draws"
 
 
 def sweep_runs(

@@ -20,11 +20,13 @@ from mstfilter.smc import (
     Always,
     EssBelow,
     FearnheadClifford,
+    Gamma,
     Killing,
     LargestWeights,
     Multinomial,
     Normal,
     Program,
+    RandomWalkMove,
     StateSpaceModel,
     Student,
     Uniform,
@@ -32,6 +34,7 @@ from mstfilter.smc import (
     ibis,
     kalman_filter,
     observe,
+    resample_move,
     sample,
     smc2,
     tempering,
@@ -221,6 +224,61 @@ def test_smc2_doubles_filters_that_are_too_small():
     assert len(track(0, grow_below=0.0, n=50)[0].states) == 50 * 40
 
 
+def by_mean_in_the_move(theta):
+    rho = float(np.mean(theta["rho"]))
+    return bootstrap(StateSpaceModel.of(Normal(), lambda x: Normal(rho * x, 1.0), lambda x: Normal(x, 1.0)), 10)
+
+
+def by_mean_in_the_likelihood(theta):
+    sd = 0.5 + abs(float(np.mean(theta["rho"])))
+    return bootstrap(StateSpaceModel.of(Normal(), lambda x: Normal(x, 1.0), lambda x: Normal(x, sd)), 10)
+
+
+def by_number(theta):
+    rho = 0.9 if theta["rho"] > 0.9 else theta["rho"]
+    return filter_of({"rho": rho})
+
+
+def of_gammas(theta):
+    """The random numbers that a gamma variable consumes depend on its parameter."""
+    shape = 1.5 + theta["rho"]
+    return bootstrap(StateSpaceModel.of(Gamma(shape), lambda x: Gamma(shape), lambda x: Normal(x, 1.0)), 10)
+
+
+def of_moves(theta):
+    return resample_move(model_of(theta), RandomWalkMove(model_of(theta), 0.5), 10)
+
+
+@pytest.mark.parametrize(
+    ("make", "together"),
+    [
+        (filter_of, True),
+        (program_of, True),
+        (by_mean_in_the_move, False),
+        (by_mean_in_the_likelihood, False),
+        (by_number, False),
+        (of_gammas, False),
+        (of_moves, False),
+    ],
+)
+def test_filters_of_smc2_run_as_one_if_this_is_right(make, together):
+    default, expected = (smc2(make, YS, PRIOR, 20, 1, steps=1, **given) for given in ({}, {"batched": together}))
+    assert default.log_evidence == expected.log_evidence
+
+
+def test_an_error_that_only_many_filters_have_says_how_to_run_them_one_by_one():
+    def later(theta):
+        def move(x, t):
+            return Normal(x, 1.0 if t < 3 or np.ndim(theta["rho"]) == 0 else 1 // 0)
+
+        return bootstrap(StateSpaceModel.of(Normal(), move, lambda x: Normal(x, 1.0)), 10)
+
+    with pytest.raises(ZeroDivisionError) as error:
+        smc2(later, YS, PRIOR, 20, steps=1)
+    assert "batched=False runs them one by one" in error.value.__notes__[-1]
+    assert np.isfinite(smc2(later, YS, PRIOR, 20, steps=1, batched=False).log_evidence)
+
+
 def test_smc2_goes_on_if_a_filter_is_lost():
     """x_t = x_0 + theta: the likelihood is 0 for most parameters, and for some filters by chance."""
 
@@ -260,12 +318,8 @@ def test_what_is_refused():
     with pytest.raises(InputError, match="log_likelihood has the parameters"):
         ibis(Normal(), lambda x: -(x**2), [1.0], 10)
 
-    def mixes(theta):
-        sd = 0.5 + abs(np.mean(theta["rho"]))
-        return bootstrap(StateSpaceModel.of(Normal(), lambda x: Normal(x, 1.0), lambda x: Normal(x, float(sd))), 10)
-
     with pytest.raises(InputError, match="with one parameter vector for each particle is not that of single filters"):
-        smc2(mixes, YS, PRIOR, 10, batched=True)
+        smc2(by_mean_in_the_likelihood, YS, PRIOR, 10, batched=True)
     with pytest.raises(InputError, match="the result of filter_of is StateSpaceModel"):
         smc2(model_of, YS, PRIOR, 10)
 

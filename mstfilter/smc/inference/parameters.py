@@ -45,13 +45,13 @@ from mstfilter.smc.first_steps import unexamined
 from mstfilter.smc.history import log_evidence
 from mstfilter.smc.inference.conditional import conditional_path
 from mstfilter.smc.inference.metropolis import metropolis
-from mstfilter.smc.inputs import check_observations, split_input
+from mstfilter.smc.inputs import check_observations
 from mstfilter.smc.interfaces import Distribution
 from mstfilter.smc.models.distributions import Joint, as_distribution
-from mstfilter.smc.population import Particles, union
+from mstfilter.smc.population import Particles
 from mstfilter.smc.streams import Key
 from mstfilter.smc.summaries import data_frame, flat_columns, inference_data
-from mstfilter.smc.sweep import can_sweep, sweep_runs
+from mstfilter.smc.sweep import DIFFERENT_WEIGHTS, can_sweep, sweep_difference, sweep_runs
 
 FilterOf = Callable[[np.ndarray], ParticleFilter]
 
@@ -273,22 +273,14 @@ class _Posterior:
         return np.array([-np.inf if run.lost else run.rows["z"][-1] for run in runs])
 
     def _examine(self, first: ParticleFilter, thetas: np.ndarray) -> None:
-        """Examine the model, and compare the likelihood of many parameter vectors with that of one."""
+        """Examine the model, and compare the weights of two parameter vectors together with those of each."""
         with suppress(LostRunError):
             list(islice(first.iterate(self.observations, 0), 3))
-        y, u = split_input(self.observations[0])
-        singles: list[Any] = [self.filter_of(theta).at_step(0, u) for theta in thetas[:2]]
-        if y is None or len(singles) < 2 or first.update is None:
-            return
-        both: Any = self.filter_of(np.repeat(thetas[:2], first.n, axis=0).T).at_step(0, u)
-        drawn = [one.initial.sample(Key(k).generator(), y, first.n) for k, one in enumerate(singles)]
-        alone = [one.update.update(Key(0).generator(), x, None, y) for one, x in zip(singles, drawn, strict=True)]
-        found = both.update.update(Key(0).generator(), union(*drawn), None, y).log_weights
-        if not np.allclose(found, np.concatenate([x.log_weights for x in alone]), rtol=1e-6, atol=1e-6):
-            raise InputError(
-                "the likelihood with one parameter vector for each particle is not that of single filters",
-                "with batched=True, filter_of gets parameters of shape (d, R n): use them like particles",
-            )
+        with suppress(LostRunError):
+            alone = [self.filter_of(theta) for theta in thetas[:2]]
+            both = self.filter_of(np.repeat(thetas[:2], first.n, axis=0).T)
+            if len(alone) == 2 and sweep_difference(alone, both, self.observations) == "weights":
+                raise InputError(*DIFFERENT_WEIGHTS)
 
 
 def pmmh(
