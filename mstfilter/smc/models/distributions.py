@@ -214,12 +214,14 @@ class Normal(_Independent):
 
     def log_prob(self, value: Any) -> np.ndarray:
         z = _standardised(value, self.loc, self.scale)
-        if isinstance(self.scale, float) and z.ndim:
-            z *= z
-            z *= -0.5
+        z *= z
+        z *= -0.5
+        if isinstance(self.scale, float):
             z -= math.log(self.scale) + _HALF_LOG_2PI
-            return _sum_rows(z)
-        return _sum_rows(-0.5 * (z * z) - (np.log(self.scale) + _HALF_LOG_2PI))
+        else:
+            z -= np.log(self.scale)
+            z -= _HALF_LOG_2PI
+        return _sum_rows(z)
 
 
 @dataclass(frozen=True, eq=False)
