@@ -70,6 +70,14 @@ def test_the_same_seed_gives_the_same_bytes(recording, finished, tmp_path):
     assert any(a[k] != c[k] for k in a if k.endswith("state.npz"))
 
 
+@pytest.mark.parametrize("n_threads", [2, pytest.param(4, marks=pytest.mark.nightly), 8])
+def test_the_number_of_threads_changes_no_byte(recording, finished, tmp_path, n_threads):
+    scene_cache.clear()
+    filter_recording(recording, load_config("mst", SMALL), tmp_path / "b", seed=2, n_threads=n_threads)
+    a, b = content(finished.path), content(tmp_path / "b")
+    assert a.keys() == b.keys() and [k for k in a if a[k] != b[k]] == []
+
+
 @pytest.mark.parametrize("stop", [*(pytest.param(k, marks=pytest.mark.nightly) for k in (0, 2)), 1])
 def test_an_interrupted_run_resumes_to_the_same_result(recording, finished, tmp_path, stop):
 
