@@ -133,6 +133,7 @@ class _Sweep:
         self.runs = np.arange(n_runs)  # those that are not lost
         self.population: Population | None = None
         self.ess = self.log_mean = np.zeros(n_runs)
+        self.weights = np.ones((n_runs, filter.n))  # with maximum 1 in each run
         self.traced = not set(collectors.values()) <= {log_evidence, ess, resampled}
         #: For each step, the runs and the values of each collector.
         self.found: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
@@ -187,10 +188,11 @@ class _Sweep:
                 return
         population, moved, ancestors = self.without_lost(t, population, moved, ancestors)
         lw = population.log_weights.reshape(len(self.runs), -1)
-        self.ess, self.log_mean = summaries(lw)
+        self.ess, self.log_mean, self.weights = summaries(lw)
         if not before:
             population, moved, ancestors = self.select(t, population, None, None)
-            _, self.log_mean = summaries(population.log_weights.reshape(len(self.runs), -1))  # as `State` has it
+            lw = population.log_weights.reshape(len(self.runs), -1)
+            _, self.log_mean, self.weights = summaries(lw)  # as `State` has it
         self.population = Population.unchecked(population.particles, population.log_weights)
         self.record(t, moved, ancestors)
 
@@ -222,19 +224,19 @@ class _Sweep:
         """Resample the runs that the trigger chooses: the particles, (R,) which runs, and (R n,) ancestors."""
         runs, n = len(self.runs), self.filter.n
         lw, ess_, log_mean = population.log_weights.reshape(runs, n), self.ess, self.log_mean
-        priority = None
+        weights, priority = self.weights, None
         if lookahead is not None and y is not None:
             priority = np.asarray(lookahead.log_priority(population, y), np.float64).reshape(runs, n)
             lw = lw + priority
-            ess_, log_mean = summaries(lw)
+            ess_, log_mean, weights = summaries(lw)
         chosen = self.wanted(t, population, lw, ess_)
         index = np.tile(identity(n), (runs, 1))
         new = population.log_weights.reshape(runs, n).copy()
         rows = np.flatnonzero(chosen)
         if not len(rows):
             return population, chosen, np.arange(runs * n)
-        index[rows], weights = self.ancestors(t, population, lw, rows)
-        new[rows] = log_mean[rows, None] if weights is None else weights
+        index[rows], selected = self.ancestors(t, population, lw[rows], weights[rows], rows)
+        new[rows] = log_mean[rows, None] if selected is None else selected
         if priority is not None:
             new[rows] -= np.take_along_axis(priority[rows], index[rows], axis=1)
         flat = (index + n * np.arange(runs)[:, None]).ravel()
@@ -255,12 +257,13 @@ class _Sweep:
         return Population(take(population.particles, np.arange(row * n, row * n + n)), lw[row])
 
     def ancestors(
-        self, t: int, population: Population, lw: np.ndarray, rows: np.ndarray
+        self, t: int, population: Population, lw: np.ndarray, weights: np.ndarray, rows: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Ancestors (k, n) of k runs, and their log weights if these are not the mean weight of the run."""
+        """Ancestors (k, n) of k runs, and their log weights if these are not the mean weight of the run.
+
+        `lw` and `weights` (k, n) are those of the runs.
+        """
         resampler, rng, n = self.filter.resampler, self.rng("resampler", t), self.filter.n
-        lw = lw[rows]
-        weights = np.exp(lw - lw.max(axis=1, keepdims=True))
         if type(resampler) is Systematic:
             return inverse_cdf_of_runs(weights, rng.random((len(rows), 1))), None
         if type(resampler) is Stratified:
@@ -312,12 +315,12 @@ class _Sweep:
             return collector(*step)
 
 
-def summaries(log_weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Effective sample sizes (R,) and log mean weights (R,) of log weights (R, n), as of a `Population`."""
+def summaries(log_weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of log weights (R, n): effective sample sizes (R,), log mean weights (R,), and weights (R, n) of maximum 1."""
     top = log_weights.max(axis=1)
     weights = np.exp(log_weights - top[:, None])
     totals = weights.sum(axis=1)
-    return totals**2 / np.vecdot(weights, weights), top + np.log(totals / log_weights.shape[1])
+    return totals**2 / np.vecdot(weights, weights), top + np.log(totals / log_weights.shape[1]), weights
 
 
 def inverse_cdf_of_runs(weights: np.ndarray, shifts: np.ndarray) -> np.ndarray:
@@ -369,7 +372,7 @@ def advance_runs(
     sweep = _Sweep(filter, filter_of, list(range(n_runs)), key, {})
     if population is not None:
         sweep.population = population
-        sweep.ess, sweep.log_mean = summaries(population.log_weights.reshape(n_runs, -1))
+        sweep.ess, sweep.log_mean, sweep.weights = summaries(population.log_weights.reshape(n_runs, -1))
     try:
         sweep.step(t, *split_input(observation))
     except LostRunError:  # all weights of all runs are zero
