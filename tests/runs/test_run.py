@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -146,6 +147,19 @@ def test_times_are_no_part_of_the_result(recording, finished, tmp_path, damage):
     filter_recording(recording, load_config("mst", SMALL), run.path, seed=2)
     assert content(run.path) == content(finished.path) and run.seconds(0) == {} != run.seconds(1)
     assert len(run.estimates()) == 3
+
+
+def test_a_run_without_a_description_is_resumed(recording, finished, tmp_path):
+    shutil.copytree(finished.path, tmp_path / "run")
+    run = RunFolder.open(tmp_path / "run")
+    written = json.loads((run.path / "run.json").read_text())
+    del written["description"]
+    (run.path / "run.json").write_text(json.dumps(written))
+    shutil.rmtree(run.pause(2))
+    again = filter_recording(recording, load_config("mst", SMALL), run.path, seed=2)
+    assert again.n_pauses == 3 and again.description["status"] == "done"
+    a, b = content(finished.path), content(again.path)
+    assert [name for name in a if a[name] != b[name]] in ([], ["run.json"])
 
 
 @pytest.mark.parametrize("pause", [1, 2, 3])
