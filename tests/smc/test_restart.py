@@ -164,7 +164,9 @@ def test_moves_leave_the_evidence_of_few_particles_exact(resample, trigger):
         with unexamined():
             return np.exp(filter.run([0, 1], filter.start(key))[0].log_evidence)
 
-    cells = 35 if resample == "before" else 1  # weights are multiples of 1/5 or 1/7, or moves replace what is selected
+    cells = (
+        35 if resample == "before" else 1
+    )  # weights are multiples of 1/5 or 1/7, or moves replace what is selected
     assert sum(p * evidence for p, evidence in outcomes(run, cells)) == pytest.approx(4.0, rel=1e-12)
 
 
