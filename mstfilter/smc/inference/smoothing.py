@@ -252,14 +252,17 @@ class Moves:
             density = self.log_density(index)
             return {"index": index, "density": density}, density - now["density"]
 
-        steps = self.kernel.steps
+        steps, found = self.kernel.steps, np.empty((draws, len(parents)), np.int64)
         chain = metropolis(rng, {"index": parents, "density": density}, propose, steps * draws)
-        return np.stack([state["index"] for k, (state, _) in enumerate(chain, 1) if k % steps == 0])
+        for k, (state, _) in enumerate(chain):
+            found[k // steps] = state["index"]  # the last of each `steps` stays
+        return found
 
 
 def _by_weight(rng: np.random.Generator, population: Population, n: int) -> np.ndarray:
     """(n,) indices drawn independently by weight, in random order."""
-    return search(population.weights, rng.random(n))
+    weights = population.log_weights - population.log_weights.max()
+    return search(np.exp(weights, out=weights), rng.random(n))
 
 
 def _impossible(t: int) -> InputError:
