@@ -22,7 +22,7 @@ pytestmark = pytest.mark.nightly
 def test_benchmark_of_the_filter(tmp_path):
     run_script("benchmarks/speed.py", "--smoke", "--clock", "cpu", "--out", tmp_path)
     rows = {r["what"]: r for r in read_csv(tmp_path / "speed.csv")}
-    assert rows["array components / particles 0.4"]["median"] == "not measured"
+    assert rows["bootstrap SV T=100 n=1000 / particles 0.4"]["median"] == "not measured"
 
 
 def test_smoothing(tmp_path):
