@@ -85,3 +85,8 @@ def test_in_an_editable_install(tmp_path):
     if package != str(REPOSITORY / "mstfilter"):
         pytest.skip(f"mstfilter is not installed in editable form from here, but from {package}")
     assert folder == str(REPOSITORY / "models")
+
+
+def test_ci_builds_the_documentation():
+    for path in (".github/workflows/test.yml", ".ci/run"):
+        assert "make docs" in (REPOSITORY / path).read_text(), path

@@ -1,9 +1,10 @@
 """Measure `particles` 0.4 in a separate environment; run by speed.py, one command per line on standard input.
 
-Commands: ``filter SEED N`` (bootstrap AR(1)), ``backward:METHOD SEED N`` (N paths of a filter of N particles by the
-method ``backward_sampling_METHOD``), ``online:CLASS SEED N`` (a collector of smoothed sums), ``sampler:NAME SEED N``
-(an SMC sampler of `samplers.py`), ``SCHEME SEED N`` (resampling N even normalised weights), and ``log:SCHEME SEED N``
-(the same from log weights). The answer is one line of JSON. First calls include compilation.
+Commands: ``filter SEED N`` (bootstrap AR(1)), ``volatility SEED N`` (the same for stochastic volatility),
+``backward:METHOD SEED N`` (N paths of a filter of N particles by the method ``backward_sampling_METHOD``),
+``online:CLASS SEED N`` (a collector of smoothed sums), ``sampler:NAME SEED N`` (an SMC sampler of `samplers.py`),
+``SCHEME SEED N`` (resampling N even normalised weights), and ``log:SCHEME SEED N`` (the same from log weights). The
+answer is one line of JSON. First calls include compilation.
 """
 
 from __future__ import annotations
@@ -48,9 +49,12 @@ class AR1(ssm.StateSpaceModel):
         return x
 
 
-def bootstrap(seed: int, n: int, history: bool = False) -> tuple[float, particles.SMC]:
+def bootstrap(seed: int, n: int, history: bool = False, volatility: bool = False) -> tuple[float, particles.SMC]:
     np.random.seed(seed)  # noqa: NPY002 (its only generator)
-    fk = ssm.Bootstrap(ssm=AR1(), data=np.array(model["ys"]))
+    if volatility:
+        fk = ssm.Bootstrap(ssm=ssm.StochVol(**model["volatility"]), data=np.array(model["volatility_ys"]))
+    else:
+        fk = ssm.Bootstrap(ssm=AR1(), data=np.array(model["ys"]))
     start = clock()
     pf = particles.SMC(fk=fk, N=n, resampling="systematic", ESSrmin=0.5, store_history=history)
     pf.run()
@@ -113,8 +117,8 @@ def sampler(name: str, seed: int, n: int) -> dict:
 
 for line in sys.stdin:
     what, seed, n = line.split()
-    if what == "filter":
-        seconds, pf = bootstrap(int(seed), int(n))
+    if what in ("filter", "volatility"):
+        seconds, pf = bootstrap(int(seed), int(n), volatility=what == "volatility")
         answer = {"seconds": seconds, "log_evidence": float(pf.logLt)}
     elif what.startswith("online:"):
         answer = online(what.removeprefix("online:"), int(seed), int(n))

@@ -80,9 +80,9 @@ def logistic(seed: int, n: int, given: dict) -> tuple[float, float]:
     return found.log_evidence, float(found.mean[0])
 
 
-def volatilities(batched: bool):
+def volatilities(**settings):
     def run(seed: int, n: int, given: dict) -> tuple[float, float]:
-        found = smc2(volatility, given["sv"], SV_PRIOR, n, seed, batched=batched, steps=4, grow_below=0.0)
+        found = smc2(volatility, given["sv"], SV_PRIOR, n, seed, steps=4, grow_below=0.0, **settings)
         return found.log_evidence, float(found.mean["mu"])
 
     return run
@@ -93,8 +93,8 @@ TASKS = {
     "tempering, normal": (toy_by_tempering, 1000, "sampler:tempering"),
     "IBIS, normal": (toy_by_ibis, 1000, "sampler:ibis"),
     "tempering, logistic": (logistic, 1000, "sampler:logistic"),
-    "SMC^2, one by one": (volatilities(False), 100, "sampler:smc2"),
-    "SMC^2, batched": (volatilities(True), 100, "sampler:smc2"),
+    "SMC^2": (volatilities(), 100, "sampler:smc2"),
+    "SMC^2, one by one": (volatilities(batched=False), 100, "sampler:smc2"),
     "PaRIS, exact draws": (sums(), 100, "online:Paris"),
     "PaRIS, rejection": (sums(backward="rejection", log_bound=BOUND), 100, "online:Paris"),
     "PaRIS, mcmc": (sums(backward="mcmc"), 100, "online:Paris"),

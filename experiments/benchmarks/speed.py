@@ -44,7 +44,18 @@ RHO, SIGMA, TAU = 0.9, 0.6, 0.4
 SD0 = SIGMA / math.sqrt(1 - RHO**2)
 HERE = Path(__file__).parent
 MODEL = StateSpaceModel.of(Normal(0.0, SD0), lambda x: Normal(RHO * x, SIGMA), lambda x: Normal(x, TAU))
-
+MU, RHO_SV, SIGMA_SV = -1.0, 0.95, 0.3
+VOLATILITY = StateSpaceModel.of(
+    Normal(MU, SIGMA_SV / math.sqrt(1 - RHO_SV**2)),
+    lambda x: Normal(MU + RHO_SV * (x - MU), SIGMA_SV),
+    lambda x: Normal(0.0, np.exp(0.5 * x)),
+)
+#: Models and numbers of particles that are compared with `particles`, with the ratio to reach.
+SIZES = {("AR(1)", 10): "<= 1"} | {
+    (name, n): f"<= {target}"
+    for name in ("AR(1)", "SV")
+    for n, target in ((1_000, 0.85), (10_000, 0.6), (100_000, 0.55))
+}
 
 SCHEMES = {
     "systematic": Systematic(),
@@ -63,9 +74,9 @@ def program(previous, y):
     observe("y", Normal(x, TAU), y)
 
 
-def data(T: int) -> list[float]:
-    """T observations simulated from the model."""
-    return MODEL.simulate(T, seed=4)[1].tolist()
+def data(T: int, model: StateSpaceModel = MODEL) -> list[float]:
+    """T observations simulated from a model."""
+    return model.simulate(T, seed=4)[1].tolist()
 
 
 @dataclass(frozen=True)
@@ -122,7 +133,10 @@ def main() -> None:
     time_of = partial(timed, clock=CLOCKS[options.clock])
     worker = None
     if options.peers:
-        described = json.dumps({"rho": RHO, "sigma": SIGMA, "tau": TAU, "ys": ys, "clock": options.clock})
+        described = json.dumps(
+            {"rho": RHO, "sigma": SIGMA, "tau": TAU, "ys": ys, "clock": options.clock}
+            | {"volatility": {"mu": MU, "rho": RHO_SV, "sigma": SIGMA_SV}, "volatility_ys": data(100, VOLATILITY)}
+        )
         worker = subprocess.Popen(
             [str(options.peers), str(HERE / "peers_worker.py"), described],
             stdin=subprocess.PIPE,
@@ -136,6 +150,11 @@ def main() -> None:
         return json.loads(worker.stdout.readline())
 
     arrays, programs = bootstrap(MODEL, n), Program(program).bootstrap(n)
+    volatilities = data(100, VOLATILITY)
+    sized = {
+        (name, size): (bootstrap(MODEL, size), ys) if name == "AR(1)" else (bootstrap(VOLATILITY, size), volatilities)
+        for name, size in SIZES
+    }
     objects = ParticleFilter(
         initial=Boxes(),
         transition=Stay(),
@@ -159,8 +178,12 @@ def main() -> None:
             "program": lambda: time_of(lambda: log_evidence_of(programs, ys, seed)),
             "step_of_5_objects": lambda: time_of(lambda: objects.run(range(200), seed)) / 200,
         }
-        if worker:
-            work["particles"] = lambda: peer("filter", seed, n)["seconds"]
+        for (name, size), (filter, data) in sized.items():
+            key = f"{name} n={size}"
+            work[key] = lambda filter=filter, data=data: time_of(lambda: log_evidence_of(filter, data, seed))
+            if worker:
+                what = "filter" if name == "AR(1)" else "volatility"
+                work[f"particles {key}"] = lambda what=what, size=size: peer(what, seed, size)["seconds"]
         names = list(work)
         order.shuffle(names)  # the memory state that one program leaves affects the next
         return {name: work[name]() for name in names}
@@ -205,7 +228,12 @@ def main() -> None:
         milliseconds("the same as a program", "program"),
         ratios("array components / minimal loop", "arrays", "loop", "<= 1.3"),
         ratios("program / array components", "program", "arrays", "<= 1.5"),
-        ratios("array components / particles 0.4", "arrays", "particles", "<= 0.6"),
+        *(
+            ratios(
+                f"bootstrap {name} T=100 n={n} / particles 0.4", f"{name} n={n}", f"particles {name} n={n}", target
+            )
+            for (name, n), target in SIZES.items()
+        ),
         milliseconds("a step with 5 object particles", "step_of_5_objects", "<= 0.5"),
     ]
     for name in SCHEMES:

@@ -74,7 +74,15 @@ def finish(process: subprocess.Popen[str]) -> tuple[int, str]:
 
 def files(folder: Path) -> dict[str, bytes]:
     """What a command has written, without times and logs."""
-    skipped = ("seconds.json", "result.json", ".csv", ".log", "summary.md", "summary.tex")  # with times
+    skipped = (
+        "seconds.json",
+        "result.json",
+        ".csv",
+        ".log",
+        "summary.md",
+        "summary.tex",
+        "report.html",
+    )  # with times
     found = content(folder, lambda name: name.endswith(skipped) and not name.endswith("metrics.csv"))
     return {name: data for name, data in found.items() if not name.endswith(".log")}
 

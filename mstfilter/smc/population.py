@@ -204,7 +204,8 @@ def _numpy_array(what: str, array: Any) -> np.ndarray:
     return np.asanyarray(array)
 
 
-def _check_log_weights(lw: np.ndarray, n: int) -> None:
+def _check_log_weights(lw: np.ndarray, n: int) -> float:
+    """The largest of n log weights; InputError if they cannot be log weights, LostRunError if all are -inf."""
     if lw.shape != (n,):
         raise InputError(f"log weights have shape {lw.shape}, expected ({n},) as there are {n} particles")
     top = np.maximum.reduce(lw)  # NaN if any is NaN, so one pass finds all three errors
@@ -221,6 +222,7 @@ def _check_log_weights(lw: np.ndarray, n: int) -> None:
             f"all {n} log weights are -inf: no particle explains the observation",
             "more particles, a wider proposal, or a likelihood with heavier tails",
         )
+    return float(top)
 
 
 def _integers(what: str, index: Any) -> np.ndarray:
@@ -316,7 +318,9 @@ class Population:
     def _summary(self) -> tuple[float, float]:
         """Effective sample size and log mean weight, computed together and cached, because each step uses both."""
         if "_both" not in self.__dict__:
-            top = np.maximum.reduce(self.log_weights)  # faster than `max` for few particles
+            top = self.__dict__.get("_top")  # known if the weights have just changed
+            if top is None:
+                top = np.maximum.reduce(self.log_weights)  # faster than `max` for few particles
             weights = self.log_weights - top
             np.exp(weights, out=weights)
             total = float(np.add.reduce(weights))
@@ -436,7 +440,7 @@ class Population:
                 "select among those of positive weight: np.flatnonzero(population.weights)",
             ) from None
         new = self.labelled({name: frozen_view(index[indices]) for name, index in self.parents.items()}, self.notes)
-        new.__dict__.update(particles=_freeze(take(self.particles, indices)), log_weights=frozen_view(lw))
+        new.__dict__.update(particles=_freeze(take(self.particles, indices)), log_weights=frozen_view(lw), _top=None)
         new.__dict__.pop("_both", None)
         return new
 
@@ -492,10 +496,10 @@ class Population:
     def reweighted(self, log_factors: np.ndarray) -> Population:
         """The same particles with `log_factors` added to the log weights."""
         lw = np.asarray(self.log_weights + log_factors, dtype=np.float64)
-        _check_log_weights(lw, len(self))
+        top = _check_log_weights(lw, len(self))
         lw.flags.writeable = False
         new = self.labelled(self.parents, self.notes)  # particles and parents have been checked
-        new.__dict__["log_weights"] = lw
+        new.__dict__.update(log_weights=lw, _top=top)
         new.__dict__.pop("_both", None)
         return new
 

@@ -282,10 +282,27 @@ def search(weights: np.ndarray, points: np.ndarray, ascending: bool = False) -> 
     A search for many points is faster if the points are `ascending`.
     """
     cumulative = weights.cumsum()
-    find = _search_ascending if ascending else np.searchsorted
+    find = _search_ascending if ascending else _search_any
     index = find(cumulative, points * cumulative[-1], side="right")  # "right" skips weights of zero
     # A point rounded up to the total belongs to the last particle of positive weight.
     return np.minimum(index, cumulative.searchsorted(cumulative[-1]), out=index)
+
+
+def _search_any(edges: np.ndarray, points: np.ndarray, side: Literal["right"]) -> np.ndarray:
+    """The result of `np.searchsorted`: half of the time or less for a thousand points and edges or more.
+
+    The number of edges in lower bins than a point, from a table, is a lower bound of its index (Chen and Asau 1974).
+    """
+    n_bins = 2 * len(edges)
+    if 2 * len(points) < n_bins or len(points) < 500:
+        return np.searchsorted(edges, points, side)
+    scale = n_bins / edges[-1]
+    below = np.bincount(_bins(edges, scale, 0.0) + 1, minlength=n_bins + 2).cumsum()
+    index = below.take(_bins(points, scale, 0.0))
+    index += edges.take(index, mode="clip") <= points
+    low = np.flatnonzero(edges.take(index, mode="clip") <= points)
+    index[low] = np.searchsorted(edges, points.take(low), side)
+    return index
 
 
 def _search_ascending(edges: np.ndarray, points: np.ndarray, side: Literal["right"]) -> np.ndarray:

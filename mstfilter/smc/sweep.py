@@ -12,12 +12,13 @@ with 20,000 particles instead of 200 calls with 100: a thirtieth of the time.
 [(2,), (2,), (2,), (2,), (2,)]
 
 A sweep has random streams of its own. Its runs are independent and have the law of single runs, but not their bits.
-`mstfilter.smc.run_many` uses sweeps where it can, and `pmmh` and `ensemble` for filters with different parameters.
+`mstfilter.smc.run_many` uses sweeps where it can, and `pmmh`, `ensemble` and `smc2` for filters with different
+parameters, which `sweep_difference` compares with single ones.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,6 +27,7 @@ import numpy as np
 from mstfilter.base.errors import LostRunError, naming
 from mstfilter.smc.components import Always, EssBelow, Never
 from mstfilter.smc.filter import ParticleFilter, keep_freed_memory
+from mstfilter.smc.first_steps import first_difference, is_numeric
 from mstfilter.smc.history import Collector, by_key, check_one_shape, ess, log_evidence, resampled, stacked
 from mstfilter.smc.inputs import split_input
 from mstfilter.smc.interfaces import Info, State
@@ -42,12 +44,60 @@ class Collected:
     lost: str = ""  #: why the run is lost (all weights are zero); "" if it is not
 
 
+DIFFERENT_WEIGHTS = (
+    "the likelihood with one parameter vector for each particle is not that of single filters",
+    "with batched=True, filter_of gets arrays of one parameter per particle: use them like particles",
+)
+
+
 def can_sweep(filter: ParticleFilter) -> bool:
     """Whether runs of a filter can be swept: its components process each particle alone, and n is constant."""
     if any(getattr(filter, slot) is not None for slot in ("proposal", "rejuvenation")):
         return False
     components = (filter.initial, filter.transition, filter.update, filter.lookahead)
     return filter.resampler.exact_size and all(c is None or c.alone for c in components)
+
+
+def sweep_difference(alone: Sequence[ParticleFilter], both: ParticleFilter, observations: Sequence[Any]) -> str:
+    """Compare a filter with two parameter vectors, one for each half of its particles, with the filter of each.
+
+    In the first two steps, each component is called with the same particles and random numbers. Returns "weights" if
+    weights of particles differ from those of the filter with their parameters, which is an error. Otherwise "draws",
+    if draws differ or are objects: they may have the same law if the numbers that they consume depend on parameters.
+    Otherwise "". Raises what a component raises.
+    """
+    n, found, same_draws = alone[0].n, None, True
+    halves = slice(0, n), slice(n, 2 * n)
+
+    def weights_differ(together: Any, one_by_one: Sequence[Any]) -> bool:
+        wanted = np.concatenate([a[half] for a, half in zip(one_by_one, halves, strict=True)])
+        return not np.allclose(together, wanted, rtol=1e-6, atol=1e-6)
+
+    for t, observation in enumerate(observations[:2]):
+        y, u = split_input(observation)
+        every = [filter.at_step(t, u) for filter in (both, *alone)]
+        if found is None:
+            drawn = [f.initial.sample(Key(t).generator(), y, 2 * n) for f in every]  # type: ignore[union-attr]
+        else:
+            if both.lookahead is not None and y is not None:
+                priorities = [f.lookahead.log_priority(found, y) for f in every]  # type: ignore[union-attr]
+                if weights_differ(priorities[0], priorities[1:]):
+                    return "weights"
+            moves = [f.transition for f in every]
+            drawn = [found if m is None else m.predict(Key(t).generator(), found, y) for m in moves]
+        for one, half in zip(drawn[1:], halves, strict=True):
+            same = first_difference(drawn[0].particles, one.particles, half) is None
+            same_draws = same_draws and same and is_numeric(one.particles)
+        if same_draws and weights_differ(drawn[0].log_weights, [one.log_weights for one in drawn[1:]]):
+            return "weights"
+        found = drawn[0]
+        if y is not None and both.update is not None:
+            rng = Key(t).generator()
+            updated = [f.update.update(rng, found, None, y) for f in every]  # type: ignore[union-attr]
+            if weights_differ(updated[0].log_weights, [one.log_weights for one in updated[1:]]):
+                return "weights"
+            found = updated[0]
+    return "" if same_draws else "draws"
 
 
 def sweep_runs(
@@ -83,6 +133,7 @@ class _Sweep:
         self.runs = np.arange(n_runs)  # those that are not lost
         self.population: Population | None = None
         self.ess = self.log_mean = np.zeros(n_runs)
+        self.weights = np.ones((n_runs, filter.n))  # with maximum 1 in each run
         self.traced = not set(collectors.values()) <= {log_evidence, ess, resampled}
         #: For each step, the runs and the values of each collector.
         self.found: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
@@ -137,10 +188,11 @@ class _Sweep:
                 return
         population, moved, ancestors = self.without_lost(t, population, moved, ancestors)
         lw = population.log_weights.reshape(len(self.runs), -1)
-        self.ess, self.log_mean = summaries(lw)
+        self.ess, self.log_mean, self.weights = summaries(lw)
         if not before:
             population, moved, ancestors = self.select(t, population, None, None)
-            _, self.log_mean = summaries(population.log_weights.reshape(len(self.runs), -1))  # as `State` has it
+            lw = population.log_weights.reshape(len(self.runs), -1)
+            _, self.log_mean, self.weights = summaries(lw)  # as `State` has it
         self.population = Population.unchecked(population.particles, population.log_weights)
         self.record(t, moved, ancestors)
 
@@ -172,19 +224,19 @@ class _Sweep:
         """Resample the runs that the trigger chooses: the particles, (R,) which runs, and (R n,) ancestors."""
         runs, n = len(self.runs), self.filter.n
         lw, ess_, log_mean = population.log_weights.reshape(runs, n), self.ess, self.log_mean
-        priority = None
+        weights, priority = self.weights, None
         if lookahead is not None and y is not None:
             priority = np.asarray(lookahead.log_priority(population, y), np.float64).reshape(runs, n)
             lw = lw + priority
-            ess_, log_mean = summaries(lw)
+            ess_, log_mean, weights = summaries(lw)
         chosen = self.wanted(t, population, lw, ess_)
         index = np.tile(identity(n), (runs, 1))
         new = population.log_weights.reshape(runs, n).copy()
         rows = np.flatnonzero(chosen)
         if not len(rows):
             return population, chosen, np.arange(runs * n)
-        index[rows], weights = self.ancestors(t, population, lw, rows)
-        new[rows] = log_mean[rows, None] if weights is None else weights
+        index[rows], selected = self.ancestors(t, population, lw[rows], weights[rows], rows)
+        new[rows] = log_mean[rows, None] if selected is None else selected
         if priority is not None:
             new[rows] -= np.take_along_axis(priority[rows], index[rows], axis=1)
         flat = (index + n * np.arange(runs)[:, None]).ravel()
@@ -205,12 +257,13 @@ class _Sweep:
         return Population(take(population.particles, np.arange(row * n, row * n + n)), lw[row])
 
     def ancestors(
-        self, t: int, population: Population, lw: np.ndarray, rows: np.ndarray
+        self, t: int, population: Population, lw: np.ndarray, weights: np.ndarray, rows: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Ancestors (k, n) of k runs, and their log weights if these are not the mean weight of the run."""
+        """Ancestors (k, n) of k runs, and their log weights if these are not the mean weight of the run.
+
+        `lw` and `weights` (k, n) are those of the runs.
+        """
         resampler, rng, n = self.filter.resampler, self.rng("resampler", t), self.filter.n
-        lw = lw[rows]
-        weights = np.exp(lw - lw.max(axis=1, keepdims=True))
         if type(resampler) is Systematic:
             return inverse_cdf_of_runs(weights, rng.random((len(rows), 1))), None
         if type(resampler) is Stratified:
@@ -262,12 +315,12 @@ class _Sweep:
             return collector(*step)
 
 
-def summaries(log_weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Effective sample sizes (R,) and log mean weights (R,) of log weights (R, n), as of a `Population`."""
+def summaries(log_weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of log weights (R, n): effective sample sizes (R,), log mean weights (R,), and weights (R, n) of maximum 1."""
     top = log_weights.max(axis=1)
     weights = np.exp(log_weights - top[:, None])
     totals = weights.sum(axis=1)
-    return totals**2 / np.vecdot(weights, weights), top + np.log(totals / log_weights.shape[1])
+    return totals**2 / np.vecdot(weights, weights), top + np.log(totals / log_weights.shape[1]), weights
 
 
 def inverse_cdf_of_runs(weights: np.ndarray, shifts: np.ndarray) -> np.ndarray:
@@ -319,7 +372,7 @@ def advance_runs(
     sweep = _Sweep(filter, filter_of, list(range(n_runs)), key, {})
     if population is not None:
         sweep.population = population
-        sweep.ess, sweep.log_mean = summaries(population.log_weights.reshape(n_runs, -1))
+        sweep.ess, sweep.log_mean, sweep.weights = summaries(population.log_weights.reshape(n_runs, -1))
     try:
         sweep.step(t, *split_input(observation))
     except LostRunError:  # all weights of all runs are zero

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -68,6 +69,14 @@ def test_the_same_seed_gives_the_same_bytes(recording, finished, tmp_path):
     filter_recording(recording, load_config("mst", SMALL), tmp_path / "c", seed=3)
     c = content(tmp_path / "c")
     assert any(a[k] != c[k] for k in a if k.endswith("state.npz"))
+
+
+@pytest.mark.parametrize("n_threads", [2, pytest.param(4, marks=pytest.mark.nightly), 8])
+def test_the_number_of_threads_changes_no_byte(recording, finished, tmp_path, n_threads):
+    scene_cache.clear()
+    filter_recording(recording, load_config("mst", SMALL), tmp_path / "b", seed=2, n_threads=n_threads)
+    a, b = content(finished.path), content(tmp_path / "b")
+    assert a.keys() == b.keys() and [k for k in a if a[k] != b[k]] == []
 
 
 @pytest.mark.parametrize("stop", [*(pytest.param(k, marks=pytest.mark.nightly) for k in (0, 2)), 1])
@@ -138,6 +147,19 @@ def test_times_are_no_part_of_the_result(recording, finished, tmp_path, damage):
     filter_recording(recording, load_config("mst", SMALL), run.path, seed=2)
     assert content(run.path) == content(finished.path) and run.seconds(0) == {} != run.seconds(1)
     assert len(run.estimates()) == 3
+
+
+def test_a_run_without_a_description_is_resumed(recording, finished, tmp_path):
+    shutil.copytree(finished.path, tmp_path / "run")
+    run = RunFolder.open(tmp_path / "run")
+    written = json.loads((run.path / "run.json").read_text())
+    del written["description"]
+    (run.path / "run.json").write_text(json.dumps(written))
+    shutil.rmtree(run.pause(2))
+    again = filter_recording(recording, load_config("mst", SMALL), run.path, seed=2)
+    assert again.n_pauses == 3 and again.description["status"] == "done"
+    a, b = content(finished.path), content(again.path)
+    assert [name for name in a if a[name] != b[name]] in ([], ["run.json"])
 
 
 @pytest.mark.parametrize("pause", [1, 2, 3])

@@ -293,6 +293,12 @@ def test_check_finds_nothing_in_a_right_model(name):
     assert [result for result in check_properties(RIGHT[name], contract) if result.failure] == []
 
 
+def test_check_accepts_a_model_in_which_most_particles_may_have_weight_0():
+    contract = type("Contract", (ModelContract,), {"observations": [0.3, 1.5, 1.0]})
+    model = of(observation=lambda x: Uniform(x - 0.3, x + 0.3))
+    assert [result for result in check_properties(model, contract) if result.failure] == []
+
+
 def test_check_draws_observations_from_the_model_or_asks_for_them():
     assert all(result.failure is None for result in check_properties(of(), ModelContract))
     (first, *_) = check_properties(by_functions(), ModelContract)

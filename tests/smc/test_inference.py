@@ -23,6 +23,7 @@ from mstfilter.smc import (
     Kld,
     LargestWeights,
     Linear,
+    MultivariateNormal,
     Normal,
     Population,
     Product,
@@ -459,6 +460,10 @@ def test_parameters_are_numbers(infer):
         call(None)
     with pytest.raises(InputError, match="expected a distribution, found a builtins.float"):
         call([0.1, 0.2], prior=0.5)
+    vectors = {"rho": Normal(np.zeros((1, 3)), 1.0), "sigma": Gamma(1.0)}
+    for given in (np.zeros(2), np.zeros((2, 2)), np.zeros((2, 3, 1))):
+        with pytest.raises(InputError, match=r"start of rho has shape .*, expected \(3,\) or \(chains, 3\)"):
+            call({"rho": given, "sigma": 1.0}, prior=vectors)
     if infer is pmmh:
         with pytest.raises(InputError, match="scale is a mapping with the keys rho, sigma"):
             call([0.5, 1.0], scale={"rho": 0.1, "sigma": 0.1})
@@ -498,6 +503,39 @@ def test_names_of_parameters_are_kept():
         named["sigma"]
     function = pmmh(named_filter, YS, lambda theta: log_density([theta["rho"], theta["tau"]]), start, scale, 20)
     assert function.names == ("tau", "rho")  # without a distribution, the names are those of the start
+
+
+@pytest.mark.parametrize("batched", [False, True])
+def test_parameters_with_names_may_be_vectors(batched):
+    """The chain of a vector with a name is that of its entries, bit for bit."""
+    seen = []
+
+    def of_vectors(theta):
+        seen.append(np.shape(theta["b"])[:1])
+        return filter_of([theta["b"][0]])
+
+    vectors = {"tau": PRIOR["tau"], "b": MultivariateNormal([0.4, 0.0], [[0.16, 0.0], [0.0, 1.0]])}
+    entries = {"tau": PRIOR["tau"], "b0": Normal(0.4, 0.4), "b1": Normal(0.0, 1.0)}
+    start, scale = {"tau": [0.5, 1.0], "b": [[0.4, 0.1], [0.3, 0.2]]}, {"tau": 0.3, "b": [0.5, 0.1]}
+    found = pmmh(of_vectors, YS, vectors, start, scale, 20, batched=batched)
+    alone = pmmh(
+        lambda theta: filter_of([theta["b0"]]),
+        YS,
+        entries,
+        {"tau": [0.5, 1.0], "b0": [0.4, 0.3], "b1": [0.1, 0.2]},
+        {"tau": 0.3, "b0": 0.5, "b1": 0.1},
+        20,
+        batched=batched,
+    )
+    assert set(seen) == {(2,)} and found.names == ("tau", "b")
+    np.testing.assert_array_equal(found.theta, alone.theta)
+    np.testing.assert_array_equal(found["b"], np.stack([alone["b0"], alone["b1"]], axis=-1))
+    np.testing.assert_array_equal(found["tau"], alone["tau"])
+    assert list(found.columns())[2:5] == ["tau", "b_0", "b_1"]
+    one = pmmh(of_vectors, YS, vectors, scale={"tau": 0.1, "b": 0.1}, n_iterations=2, n_chains=3, batched=batched)
+    assert one["b"].shape == (2, 3, 2)
+    walkers = ensemble(of_vectors, YS, vectors, n_iterations=2, batched=batched)
+    assert walkers["b"].shape == (2, 12, 2)
 
 
 def test_first_parameters_are_draws_from_the_prior():

@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
 from mstfilter.base.errors import InputError
 from mstfilter.smc import (
+    Always,
     EssBelow,
     Every,
     Key,
+    Never,
     Normal,
     Population,
     RandomWalkMove,
+    Rejuvenation,
     State,
     StateSpaceModel,
     bootstrap,
     resample_move,
 )
+from mstfilter.smc.first_steps import unexamined
+from tests.smc.enumeration import outcomes
 from tests.smc.models import AR1, ar1_observations, kalman_ar1
 
 YS = ar1_observations(12)
@@ -116,6 +121,53 @@ def test_moves_after_the_update_do_not_depend_on_the_trigger(trigger):
     before = replace(filter, resample="before")  # here the trigger has only seen their parents
     _, infos = before.run(YS, 0)
     assert [("rejuvenation" in info.notes) == info.resampled for info in infos] == [True] * len(YS)
+
+
+class ScriptedKey(Key):
+    """All streams of a run are one generator, whose outcomes are enumerated."""
+
+    def child(self, *parts):
+        return self
+
+    def generator(self):
+        return self.__dict__["rng"]
+
+
+@dataclass(frozen=True)
+class ExactMove(Rejuvenation):
+    """Draws x_0 given y_0 anew: it is 1 with probability 3/4."""
+
+    def move(self, rng, population, previous, observation):
+        if previous is not None:
+            return population
+        return population.moved((rng.integers(0, 4, len(population)) > 0).astype(int))
+
+
+@pytest.mark.parametrize("resample", ["after", "before"])
+@pytest.mark.parametrize("trigger", [EssBelow(0.8), Every(2), Always(), Never()])
+def test_moves_leave_the_evidence_of_few_particles_exact(resample, trigger):
+    """By enumeration of all draws of three particles with two states, which do not change.
+
+    The trigger `EssBelow` resamples if one particle of three has state 1, and not if two have.
+    """
+    likelihoods = np.array([[1.0, 3.0], [5.0, 1.0]])
+    model = StateSpaceModel(
+        lambda rng, n: rng.integers(0, 2, n),
+        lambda rng, x: x,
+        lambda x, y: np.log(likelihoods[y, x]),
+    )
+    filter = replace(bootstrap(model, 3, trigger=trigger), rejuvenation=ExactMove(), resample=resample)
+
+    def run(rng):
+        key = ScriptedKey(0)
+        key.__dict__["rng"] = rng
+        with unexamined():
+            return np.exp(filter.run([0, 1], filter.start(key))[0].log_evidence)
+
+    cells = (
+        35 if resample == "before" else 1
+    )  # weights are multiples of 1/5 or 1/7, or moves replace what is selected
+    assert sum(p * evidence for p, evidence in outcomes(run, cells)) == pytest.approx(4.0, rel=1e-12)
 
 
 def test_a_seed_has_one_name():

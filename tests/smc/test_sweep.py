@@ -185,7 +185,8 @@ def test_draws_of_runs_are_those_of_single_schemes(n):
     counts = np.bincount(drawn.ravel(), minlength=n) / drawn.size
     p = weights[0] / weights[0].sum()
     assert (abs(counts - p) < 6 * np.sqrt(p * (1 - p) / drawn.size) + 1e-12).all()
-    spread, log_mean = summaries(lw)
+    spread, log_mean, scaled = summaries(lw)
+    np.testing.assert_array_equal(scaled, weights)
     for row, (a, b) in enumerate(zip(spread, log_mean, strict=True)):
         population = Population(np.zeros(n), lw[row])
         assert (a, b) == (pytest.approx(population.ess), pytest.approx(population.log_mean_weight))

@@ -68,7 +68,7 @@ def metropolis(
     """
     for _ in range(steps):
         new, log_ratio = propose(rng, state)
-        accepted = np.log1p(-rng.random(len(log_ratio))) < log_ratio
+        accepted = -rng.standard_exponential(len(log_ratio)) < log_ratio  # the log of a uniform number
         state = choose_rows(accepted, new, state)
         yield state, accepted
 

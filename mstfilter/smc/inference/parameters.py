@@ -28,10 +28,11 @@ arrays that returns the log density, and `start` and `scale` are arrays.
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import islice
 from typing import Any
@@ -44,13 +45,13 @@ from mstfilter.smc.first_steps import unexamined
 from mstfilter.smc.history import log_evidence
 from mstfilter.smc.inference.conditional import conditional_path
 from mstfilter.smc.inference.metropolis import metropolis
-from mstfilter.smc.inputs import check_observations, split_input
+from mstfilter.smc.inputs import check_observations
 from mstfilter.smc.interfaces import Distribution
 from mstfilter.smc.models.distributions import Joint, as_distribution
-from mstfilter.smc.population import Particles, union
+from mstfilter.smc.population import Particles
 from mstfilter.smc.streams import Key
 from mstfilter.smc.summaries import data_frame, flat_columns, inference_data
-from mstfilter.smc.sweep import can_sweep, sweep_runs
+from mstfilter.smc.sweep import DIFFERENT_WEIGHTS, can_sweep, sweep_difference, sweep_runs
 
 FilterOf = Callable[[np.ndarray], ParticleFilter]
 
@@ -65,15 +66,21 @@ class Chains:
     log_density: np.ndarray  #: (n_iterations, n_chains) log prior plus `log_evidence`
     accepted: np.ndarray  #: (n_chains,) share of accepted proposals
     paths: tuple[Particles, ...] = ()  #: of `particle_gibbs`: the path of states after each iteration
-    names: tuple[str, ...] = ()  #: of the d parameters; () if they have none
+    #: Shape of each parameter by name: () for a number, (k,) for a vector of k of the d entries. Empty without names.
+    shapes: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters; () if they have none."""
+        return tuple(self.shapes)
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """(n_iterations, n_chains) values of the parameter with a name."""
-        if name not in self.names:
+        """(n_iterations, n_chains, ...) values of the parameter with a name."""
+        if name not in self.shapes:
             raise KeyError(
                 f"there is no parameter {name!r}; there are: {', '.join(self.names) or 'none with a name'}"
             )
-        return self.theta[..., self.names.index(name)]
+        return np.moveaxis(_by_name(np.moveaxis(self.theta, -1, 0), self.shapes)[name], (-2, -1), (0, 1))
 
     def __repr__(self) -> str:
         n_iterations, n_chains, d = self.theta.shape
@@ -129,16 +136,18 @@ class _Parameters:
     """Log prior, names and forms of parameters, which are vectors (d,) inside of the chains."""
 
     def __init__(self, prior: Any, start: Any) -> None:
-        self.names: tuple[str, ...] = ()
+        self.shapes: dict[str, tuple[int, ...]] = {}  #: by name; empty if the parameters have no names
         self.number = False  #: whether the only parameter is a number, as the prior draws it
         self.prior: Distribution | None = None
         if not callable(prior):
             self.prior = as_distribution(prior)
-            self.names = tuple(self.prior.parts) if isinstance(self.prior, Joint) else ()
-            self.number = not self.names and self.prior.event_shape == ()
+            if isinstance(self.prior, Joint):
+                drawn = self.prior.sample(np.random.default_rng(0), 1)
+                self.shapes = {name: np.shape(a)[1:] for name, a in drawn.items()}
+            self.number = not self.shapes and self.prior.event_shape == ()
             prior = self.prior.log_prob
         if isinstance(start, Mapping) and self.prior is None:
-            self.names = tuple(map(str, start))
+            self.shapes = {str(name): () for name in start}
         self.function = prior
 
     def log_prior(self, theta: np.ndarray) -> float:
@@ -150,8 +159,8 @@ class _Parameters:
 
     def form(self, theta: np.ndarray) -> Any:
         """What `filter_of` and the prior get: entries of ``theta`` by name, the only entry, or the array itself."""
-        if self.names:
-            return dict(zip(self.names, theta, strict=True))
+        if self.shapes:
+            return _by_name(theta, self.shapes)
         return theta[0] if self.number else theta
 
     def start(self, given: Any, n: int | None, rng: np.random.Generator) -> np.ndarray:
@@ -166,22 +175,35 @@ class _Parameters:
         return drawn if drawn.ndim == 2 else drawn[:, None]
 
     def vector(self, what: str, given: Any) -> np.ndarray:
-        """Numbers (..., d), from an array, or from a mapping from the names to numbers or arrays (...)."""
-        if not isinstance(given, Mapping) or not self.names:
+        """Numbers (..., d), from an array, or from a mapping from the names to numbers or arrays (..., *shape)."""
+        if not isinstance(given, Mapping) or not self.shapes:
             return _numbers(what, given)
-        if set(given) != set(self.names):
-            raise InputError(f"{what} has the names {sorted(map(str, given))}, expected {sorted(self.names)}")
+        if set(given) != set(self.shapes):
+            raise InputError(f"{what} has the names {sorted(map(str, given))}, expected {sorted(self.shapes)}")
+        columns = []
+        for name, shape in self.shapes.items():
+            a = _numbers(f"{what} of {name}", given[name])
+            a = np.broadcast_to(a, shape) if not a.ndim else a  # one number stands for all entries
+            chains = a.shape[: a.ndim - len(shape)]
+            if a.shape[len(chains) :] != shape or len(chains) > 1:
+                each = f"{shape} or (chains, {', '.join(map(str, shape))})" if shape else "one number per chain"
+                raise InputError(f"{what} of {name} has shape {a.shape}, expected {each}")
+            columns.append(a.reshape(*chains, math.prod(shape)))
         try:
-            columns = np.broadcast_arrays(*(_numbers(f"{what} of {name}", given[name]) for name in self.names))
+            chains = np.broadcast_shapes(*(a.shape[:-1] for a in columns))
         except ValueError as error:
-            shapes = {name: np.shape(given[name]) for name in self.names}
+            shapes = {name: np.shape(given[name]) for name in self.shapes}
             raise InputError(f"{what} has arrays of different lengths: {shapes}") from error
-        if columns[0].ndim > 1:
-            raise InputError(
-                f"{what} of {self.names[0]} has shape {columns[0].shape}, expected one number per chain",
-                "give each entry of a vector a name of its own, or all parameters as an array without names",
-            )
-        return np.stack(columns, axis=-1)
+        return np.concatenate([np.broadcast_to(a, (*chains, a.shape[-1])) for a in columns], axis=-1)
+
+
+def _by_name(theta: np.ndarray, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
+    """Parameters of the given shapes, from their entries (d, ...): arrays (*shape, ...), or numbers."""
+    found, end = {}, 0
+    for name, shape in shapes.items():
+        begin, end = end, end + math.prod(shape)
+        found[name] = theta[begin:end].reshape(*shape, *theta.shape[1:]) if shape else theta[begin]
+    return found
 
 
 @dataclass
@@ -251,22 +273,14 @@ class _Posterior:
         return np.array([-np.inf if run.lost else run.rows["z"][-1] for run in runs])
 
     def _examine(self, first: ParticleFilter, thetas: np.ndarray) -> None:
-        """Examine the model, and compare the likelihood of many parameter vectors with that of one."""
+        """Examine the model, and compare the weights of two parameter vectors together with those of each."""
         with suppress(LostRunError):
             list(islice(first.iterate(self.observations, 0), 3))
-        y, u = split_input(self.observations[0])
-        singles: list[Any] = [self.filter_of(theta).at_step(0, u) for theta in thetas[:2]]
-        if y is None or len(singles) < 2 or first.update is None:
-            return
-        both: Any = self.filter_of(np.repeat(thetas[:2], first.n, axis=0).T).at_step(0, u)
-        drawn = [one.initial.sample(Key(k).generator(), y, first.n) for k, one in enumerate(singles)]
-        alone = [one.update.update(Key(0).generator(), x, None, y) for one, x in zip(singles, drawn, strict=True)]
-        found = both.update.update(Key(0).generator(), union(*drawn), None, y).log_weights
-        if not np.allclose(found, np.concatenate([x.log_weights for x in alone]), rtol=1e-6, atol=1e-6):
-            raise InputError(
-                "the likelihood with one parameter vector for each particle is not that of single filters",
-                "with batched=True, filter_of gets parameters of shape (d, R n): use them like particles",
-            )
+        with suppress(LostRunError):
+            alone = [self.filter_of(theta) for theta in thetas[:2]]
+            both = self.filter_of(np.repeat(thetas[:2], first.n, axis=0).T)
+            if len(alone) == 2 and sweep_difference(alone, both, self.observations) == "weights":
+                raise InputError(*DIFFERENT_WEIGHTS)
 
 
 def pmmh(
@@ -290,16 +304,18 @@ def pmmh(
     ----------
     filter_of : callable
         ``(theta) -> ParticleFilter``. The components of the filter must be properly weighted. ``theta`` is what the
-        prior draws, as in `smc2`: a mapping from names to numbers, an array (d,), or a number if the prior is a
-        distribution of numbers. It is an array (d,) if the prior is a function.
+        prior draws, as in `smc2`: a mapping from names to numbers or vectors, an array (d,), or a number if the prior
+        is a distribution of numbers. It is an array (d,) if the prior is a function.
     prior : mapping, Distribution or callable
         A distribution for each name; a joint distribution, such as `Product`, `MultivariateNormal` or one of
         scipy.stats; or a function ``(theta) -> float``, the log density, -inf outside of the support.
     start : mapping, (d,) or (R, d) array_like, optional
-        First parameters of one chain or of R chains: numbers or arrays (R,) by name, or an array in the order in
-        which `filter_of` takes them. By default, `n_chains` chains start at draws from the prior.
+        First parameters of one chain or of R chains: numbers or arrays (R,) by name, vectors (k,) or (R, k) where the
+        prior of a name draws vectors, or an array in the order in which `filter_of` takes them. By default,
+        `n_chains` chains start at draws from the prior.
     scale : mapping, (d,) or (d, d) array_like
-        Standard deviations or covariance of a step. A good choice is 2.4 / sqrt(d) posterior standard deviations.
+        Standard deviations, by name as in `start`, or covariance of a step. A good choice is 2.4 / sqrt(d) posterior
+        standard deviations.
     batched : bool
         Whether ``filter_of`` also accepts arrays (m,) in place of numbers, or (d, m) in place of (d,): parameters for
         each of the m particles.
@@ -333,7 +349,7 @@ def pmmh(
         steps.append({**state, "accepted": accepted})
     found = {name: np.stack([step[name] for step in steps]) for name in steps[0]}
     accepted = found["accepted"].mean(axis=0)
-    return Chains(found["theta"], found["log_evidence"], found["log_density"], accepted, names=parameters.names)
+    return Chains(found["theta"], found["log_evidence"], found["log_density"], accepted, shapes=parameters.shapes)
 
 
 def _start(posterior: _Posterior, key: Key, theta: np.ndarray) -> dict[str, np.ndarray]:
@@ -431,7 +447,7 @@ def ensemble(
     sampler.run_mcmc(emcee.State(theta, random_state=own.get_state()), n_iterations)
     evidence = sampler.get_blobs().reshape(n_iterations, len(theta))
     accepted = sampler.acceptance_fraction
-    return Chains(sampler.get_chain(), evidence, sampler.get_log_prob(), accepted, names=parameters.names)
+    return Chains(sampler.get_chain(), evidence, sampler.get_log_prob(), accepted, shapes=parameters.shapes)
 
 
 def particle_gibbs(

@@ -10,7 +10,7 @@ filter over all observations so far, and accepts both as `pmmh` does.
 ...     rho = theta["rho"]
 ...     model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(rho * x, 0.5), lambda x: Normal(x, 1.0))
 ...     return bootstrap(model, n=50)
->>> found = smc2(filter_of, [0.3, -0.1, 0.8, 0.9], {"rho": Uniform(-1.0, 1.0)}, n=100, steps=4, batched=True)
+>>> found = smc2(filter_of, [0.3, -0.1, 0.8, 0.9], {"rho": Uniform(-1.0, 1.0)}, n=100, steps=4)
 >>> found.population.particles["rho"].shape, len(found.states)
 ((100,), 5000)
 >>> mean = found.states.weights @ found.states.particles                    # E[x_3 | y_0 .. y_3], over all parameters
@@ -21,6 +21,7 @@ filters are too noisy: then each filter is replaced by one with twice as many pa
 
 from __future__ import annotations
 
+import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
@@ -35,12 +36,13 @@ from mstfilter.smc.components import EssBelow
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.first_steps import unexamined
 from mstfilter.smc.inference.samplers import LOG_LIKELIHOOD, Rows, Sampled, Sampler, Target
-from mstfilter.smc.inputs import check_observations, split_input
-from mstfilter.smc.interfaces import Resampler, Trigger
-from mstfilter.smc.population import Particles, Population, log_mean_exp, take, union
+from mstfilter.smc.inputs import check_observations
+from mstfilter.smc.interfaces import Distribution, Resampler, Trigger
+from mstfilter.smc.models.distributions import as_distribution
+from mstfilter.smc.population import Particles, Population, log_mean_exp, take
 from mstfilter.smc.resampling import Systematic
 from mstfilter.smc.streams import Key
-from mstfilter.smc.sweep import advance_runs, can_sweep
+from mstfilter.smc.sweep import DIFFERENT_WEIGHTS, advance_runs, can_sweep, sweep_difference
 
 #: Variables of a parameter vector: of a sweep, the log weights (n, m) and particles (n, m, ...) of m particles of its
 #: filter, where an array has the name `_X`; otherwise the filter with its state, as an object.
@@ -54,7 +56,7 @@ def smc2(
     n: int = 500,
     seed: int = 0,
     *,
-    batched: bool = False,
+    batched: bool | None = None,
     function: Callable[[Particles], np.ndarray] | None = None,
     steps: int = 4,
     waste_free: bool = True,
@@ -74,9 +76,10 @@ def smc2(
         or a mapping from names to these, as the prior draws it.
     n : int
         Number of parameter vectors.
-    batched : bool
-        Whether ``filter_of`` also accepts the parameters of all particles of all filters: arrays (m,), or (d, m) for
-        a vector. The filters then run in one sweep, which is much faster (`pmmh`).
+    batched : bool, optional
+        Whether the filters of all parameter vectors run in one sweep, which is much faster. ``filter_of`` then also
+        gets the parameters of all particles of all filters: arrays (m,), or (d, m) for a vector. By default they do
+        if the filter of two parameter vectors together agrees with the filter of each.
     function : callable, optional
         ``(particles) -> (m, ...)`` of states x_t, whose means given y_0 .. y_t are estimated at every step
         (`Sampled.state_mean`).
@@ -89,11 +92,19 @@ def smc2(
     check_number("grow_below", grow_below, at_least=0, at_most=1)
     check_integer("most_particles", most_particles)
     ys = list(check_observations(observations))
+    chosen = batched is None
+    if batched is None:
+        batched = _agree(filter_of, as_distribution(prior), ys)
     kind = _Swept if batched else _Single
     target = kind(filter_of, grow_below, most_particles)
     means = None if function is None else lambda rows: target.means(rows, function)
     sampler = Sampler(prior, target, n, steps, waste_free, scale, resampler, trigger)
-    found = sampler.sample((ys[: t + 1] for t in range(len(ys))), seed, lag, extra=means)
+    try:
+        found = sampler.sample((ys[: t + 1] for t in range(len(ys))), seed, lag, extra=means)
+    except Exception as error:
+        if chosen and batched:
+            error.add_note("the filters of all parameters ran as one; batched=False runs them one by one")
+        raise
     assert found.run.state.population is not None
     return replace(found, states=target.states(found.run.state.population))
 
@@ -204,26 +215,9 @@ class _Swept(_Filters):
     ) -> tuple[Rows, np.ndarray]:
         if len(data) == 1 and len(population) > 1:
             with suppress(LostRunError):
-                self._compare(theta, data[0])
+                if _difference(self.made, theta, data) == "weights":
+                    raise InputError(*DIFFERENT_WEIGHTS)
         return super().extend(rng, theta, population, data)
-
-    def _compare(self, theta: Any, observation: Any) -> None:
-        """Raise InputError unless the likelihood of two parameter vectors together is that of each alone."""
-        y, u = split_input(observation)
-        alone: list[Any] = [self.made(_one(theta, i), None).at_step(0, u) for i in range(2)]
-        n = alone[0].n
-        both: Any = self.made(_repeated(theta, np.arange(2), n), None).at_step(0, u)
-        if y is None or both.update is None:
-            return
-        drawn = [one.initial.sample(Key(i).generator(), y, n) for i, one in enumerate(alone)]
-        found = [one.update.update(Key(0).generator(), x, None, y) for one, x in zip(alone, drawn, strict=True)]
-        together = both.update.update(Key(0).generator(), union(*drawn), None, y)
-        wanted = np.concatenate([one.log_weights for one in found])
-        if not np.allclose(together.log_weights, wanted, rtol=1e-6, atol=1e-6):
-            raise InputError(
-                "the likelihood with one parameter vector for each particle is not that of single filters",
-                "with batched=True, filter_of gets arrays of one parameter per particle: use them like particles",
-            )
 
     def stepper(self, theta: Any, n: int, size: int | None) -> Callable[..., Rows]:
         first = self.made(_one(theta, 0), size)
@@ -272,6 +266,31 @@ class _Swept(_Filters):
         weights = np.exp(lw - lw.max(axis=1, keepdims=True))
         values = np.asarray(function(_particles(rows)), np.float64).reshape(*lw.shape, -1)
         return np.einsum("nm,nmk->nk", weights / weights.sum(axis=1, keepdims=True), values)
+
+
+def _agree(filter_of: Callable[[Any], ParticleFilter], prior: Distribution, observations: list[Any]) -> bool:
+    """Whether filters of several parameter vectors can run as one: two agree with single ones in the first steps."""
+    for seed in range(5):  # the likelihood of some parameters may be 0
+        theta = prior.sample(np.random.default_rng(seed), 2)
+        with suppress(LostRunError):
+            single = filter_of(_one(theta, 0))
+            if not isinstance(single, ParticleFilter) or not can_sweep(single):
+                return False
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                try:
+                    return not _difference(lambda theta, size: filter_of(theta), theta, observations)
+                except LostRunError:
+                    raise
+                except Exception:  # what a function of the user may do with arrays
+                    return False
+    return False
+
+
+def _difference(made: Callable[..., ParticleFilter], theta: Any, observations: list[Any]) -> str:
+    """How the filter of the first two parameter vectors together differs from those of each (`sweep_difference`)."""
+    alone = [made(_one(theta, i), None) for i in range(2)]
+    return sweep_difference(alone, made(_repeated(theta, np.arange(2), alone[0].n), None), observations)
 
 
 def _particles(rows: Mapping[str, np.ndarray]) -> Particles:

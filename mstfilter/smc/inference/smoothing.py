@@ -32,7 +32,7 @@ from mstfilter.smc.inference.metropolis import metropolis
 from mstfilter.smc.inputs import check_observations, split_input
 from mstfilter.smc.interfaces import DensityTransition, State
 from mstfilter.smc.population import Particles, Population, count_particles, take
-from mstfilter.smc.resampling import draw_log, independent_draws
+from mstfilter.smc.resampling import draw_log, search
 
 BackwardMethod = Literal["exact", "mcmc", "rejection"]
 #: Largest number of pairs of particles in a call of `log_prob`.
@@ -231,7 +231,7 @@ class Moves:
             density = self.log_density(proposed, rows[left])
             if (density > bound + 1e-9).any():
                 raise InputError(f"log_bound is {bound}, and a log density from step {self.t} is {density.max()}")
-            accepted = np.log1p(-rng.random(len(left))) < density - bound
+            accepted = -rng.standard_exponential(len(left)) < density - bound
             index[left[accepted]] = proposed[accepted]
             left, share = left[~accepted], np.mean(accepted)
             if share < 20 / len(self.population):  # the exact draw takes less time than the expected trials
@@ -252,16 +252,17 @@ class Moves:
             density = self.log_density(index)
             return {"index": index, "density": density}, density - now["density"]
 
-        steps = self.kernel.steps
+        steps, found = self.kernel.steps, np.empty((draws, len(parents)), np.int64)
         chain = metropolis(rng, {"index": parents, "density": density}, propose, steps * draws)
-        return np.stack([state["index"] for k, (state, _) in enumerate(chain, 1) if k % steps == 0])
+        for k, (state, _) in enumerate(chain):
+            found[k // steps] = state["index"]  # the last of each `steps` stays
+        return found
 
 
 def _by_weight(rng: np.random.Generator, population: Population, n: int) -> np.ndarray:
     """(n,) indices drawn independently by weight, in random order."""
-    index = independent_draws(rng, population.weights, n)
-    rng.shuffle(index)
-    return index
+    weights = population.log_weights - population.log_weights.max()
+    return search(np.exp(weights, out=weights), rng.random(n))
 
 
 def _impossible(t: int) -> InputError:

@@ -34,7 +34,7 @@ from mstfilter.smc.interfaces import Distribution, Proposal, Transition, Update
 from mstfilter.smc.models.distributions import as_distribution
 from mstfilter.smc.models.state_space import Dynamics, StateSpaceModel
 from mstfilter.smc.population import Population, log_mean_exp, take
-from mstfilter.smc.resampling import independent_draws
+from mstfilter.smc.resampling import independent_draws, search
 from mstfilter.smc.streams import Key
 
 TwoFilterMethod = Literal["exact", "linear"]
@@ -100,8 +100,7 @@ def two_filter(
         rng, n = key.child("pairs", t).generator(), len(later)
         weighted = later.reweighted(rest)
         rows = independent_draws(rng, weighted.weights, n)
-        index = independent_draws(rng, moves.population.weights, n)
-        rng.shuffle(index)
+        index = search(moves.population.weights, rng.random(n))  # in random order
         smoothed.append(Population(take(later.particles, rows), moves.log_density(index, rows)))
     return tuple(smoothed)
 

@@ -193,15 +193,23 @@ class Normal(_Independent):
     ranges: ClassVar = {"loc": FINITE, "scale": POSITIVE}
 
     def __post_init__(self) -> None:
-        usual = type(self.scale) is float and 0.0 < self.scale < math.inf and type(self.loc) is np.ndarray
-        if not (usual and self.loc.dtype.kind == "f"):
+        rows = self._rows
+        number = self.scale if rows is self.loc else self.loc
+        usual = rows is not None and rows.dtype.kind == "f" and -math.inf < number < math.inf
+        if not (usual and (rows is self.scale or number > 0.0)):
             super().__post_init__()
 
     @property
+    def _rows(self) -> np.ndarray | None:
+        """The parameter with a row for each particle, if the other one is a float: the usual cases."""
+        if type(self.scale) is float and type(self.loc) is np.ndarray:
+            return self.loc
+        return self.scale if type(self.loc) is float and type(self.scale) is np.ndarray else None
+
+    @property
     def parameter_shape(self) -> tuple[int, ...]:
-        if type(self.scale) is float and type(self.loc) is np.ndarray:  # the usual case
-            return self.loc.shape
-        return super().parameter_shape
+        rows = self._rows
+        return super().parameter_shape if rows is None else rows.shape
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         loc, scale = self.loc, self.scale
@@ -214,12 +222,14 @@ class Normal(_Independent):
 
     def log_prob(self, value: Any) -> np.ndarray:
         z = _standardised(value, self.loc, self.scale)
-        if isinstance(self.scale, float) and z.ndim:
-            z *= z
-            z *= -0.5
+        z *= z
+        z *= -0.5
+        if isinstance(self.scale, float):
             z -= math.log(self.scale) + _HALF_LOG_2PI
-            return _sum_rows(z)
-        return _sum_rows(-0.5 * (z * z) - (np.log(self.scale) + _HALF_LOG_2PI))
+        else:
+            z -= np.log(self.scale)
+            z -= _HALF_LOG_2PI
+        return _sum_rows(z)
 
 
 @dataclass(frozen=True, eq=False)

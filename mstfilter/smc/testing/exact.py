@@ -38,6 +38,7 @@ from mstfilter.smc.testing.contract import (
     FALSE_ALARM,
     Contract,
     OutOfTime,
+    reports_errors,
     seeded,
     skip_unless_properly_weighted,
     statistical,
@@ -67,13 +68,23 @@ class ExactContract(Contract):
     returns = Population
     columns: ClassVar[str] = "x"  #: name of the columns of compared rows, for messages
     exact: Callable[[np.random.Generator, int], tuple[Any, ...]] | None = None
+    exact_types: ClassVar[tuple[Any, ...]] = (Population, Population)  #: what `exact` returns before the observation
     n_draws: ClassVar[int] = 200_000  #: rows of `exact` in a test. Fewer rows detect only larger faults
 
     def exact_case(self, seed: int, n: int) -> tuple[Any, ...]:
         """The result of `exact`. Skips the test if no `exact` is defined."""
         if self.exact is None:
             raise SkipTest("there are no exact draws to compare with: write exact(rng, n)")
-        return self.exact(seeded(seed), n)
+        with reports_errors("exact(rng, n)"):
+            found = self.exact(seeded(seed), n)
+        k, items = len(self.exact_types), found if isinstance(found, tuple | list) else (found,)
+        fits = len(items) > k and all(map(isinstance, items, self.exact_types))
+        expected = f"a Population of {n} particles" if k == 1 else f"two Populations of {n} particles"
+        assert fits and all(one is None or len(one) == n for one in items[:k]), (
+            f"exact(rng, {n}) returned {', '.join(map(_kind, items))}; expected {expected} and the observation: "
+            "Population(x) makes one of an array"
+        )
+        return tuple(items)
 
     def draws_in_time(self, call: Callable[[int], Any]) -> int:
         """`n_draws`, or as many as the component processes in the time left. ``call(n)`` uses n particles."""
@@ -199,6 +210,11 @@ class DrawsContract(ExactContract):
         """Compare the distributions of weighted rows, and their mean weights."""
         self.compare_weighted(*found, *exact)
         check_mean_weight(np.exp(found[1]), np.exp(exact[1]))
+
+
+def _kind(item: Any) -> str:
+    """What `exact` returned, for messages."""
+    return f"a Population of {len(item)}" if isinstance(item, Population) else type(item).__name__
 
 
 def check_parents(result: Population, name: str, n: int) -> None:

@@ -167,9 +167,9 @@ class ModelContract(ExactContract):
         self.check_independent(moved)
         if isinstance(transition, ProgramTransition):
             return  # the densities of its sites have been compared
-        among = before.take(np.arange(0, len(before), 10))
+        among = Population(take(before.particles, np.arange(0, len(before), 10)))
         row = len(among) // 2
-        two = among.take(np.array([row, row]))
+        two = Population(take(among.particles, np.array([row, row])))
         pairs = [
             (transition.predict(child(seeded(8), k), two, y), transition.predict(child(seeded(9), k), among, y))
             for k in range(1000)

@@ -239,6 +239,7 @@ class RejuvenationContract(DrawsContract):
     """
 
     columns = "(x_t, x_t - x_{t-1}) after five moves of exact draws"
+    exact_types = (Population | None, Population)
 
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
         return {**super().inputs(n, seed), "previous": self.example(seeded(seed + 1), n)[0]}

@@ -49,6 +49,7 @@ class ProposalContract(DrawsContract):
     ``log_likelihood(particles) -> (n,)`` multiplies all weights, so that the weights vary less.
     """
 
+    exact_types = (Population,)
     independent = False
 
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:

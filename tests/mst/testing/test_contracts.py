@@ -130,6 +130,42 @@ def test_a_property_that_needs_exact_draws_says_how_to_write_them():
     assert "write exact(rng, n)" in reasons["distribution_is_exact"]
 
 
+def arrays(rng, n):
+    return rng.normal(size=n), rng.normal(size=n), 0.7
+
+
+def fails(rng, n):
+    return rng.normals(n)
+
+
+WRONG_EXACT = {
+    "ndarray, ndarray, float; expected two Populations of 1000": (faults.CorrectDensity(), arrays),
+    "ndarray, ndarray, float; expected two Populations": (faults.Posterior(), arrays),
+    "ndarray, ndarray, float; expected a Population": (faults.proposal(faults.antithetic)(), arrays),
+    "NoneType, a Population of 9000, float; expected two": (
+        faults.Posterior(),
+        lambda rng, n: (None, smc.Population(rng.normal(size=9000)), 0.7),
+    ),
+    "a Population of 5, a Population of 5, float; expected two": (
+        faults.CorrectDensity(),
+        lambda rng, n: faults.exact_walk(rng, 5),
+    ),
+    "a Population of 9000; expected two": (
+        RandomWalkMove(AR1, 0.7),
+        lambda rng, n: smc.Population(rng.normal(size=9000)),
+    ),
+    "exact(rng, n): it raises AttributeError": (faults.CorrectDensity(), fails),
+}
+
+
+@pytest.mark.parametrize("message", WRONG_EXACT)
+def test_wrong_exact_draws_do_not_blame_the_component(message):
+    component, exact = WRONG_EXACT[message]
+    found = failures_of(component, exact=exact)
+    assert found and all(failure.startswith("exact(rng, ") for failure in found.values())
+    assert any(message in failure for failure in found.values())
+
+
 class OtherNames(Update):
     def update(self, g, before, new, y):
         return faults.Posterior().update(g, before, new, y)

@@ -198,17 +198,22 @@ def _compare(call: Call, alone: Call | None, rows: np.ndarray, thorough: bool) -
 
     If `thorough`, also at the value of another particle.
     """
-    position = call.positions(rows)
-    here, there = np.flatnonzero(position >= 0), range(0) if alone is None else alone.reached
-    among = call.densities(call.value)
-    if alone is None or list(here) != list(there):
-        left_out = np.setdiff1d(here, there)
-        if np.setdiff1d(there, here).size or (call.distribution is None and among[position[left_out]].any()):
-            raise InputError(f"{call.what} is not reached by the same particles among the others and alone", *_ALONE)
-        return
-    if not len(here):
-        return
-    k = position[here]
+    if call.rows is None and alone is not None and alone.rows is None:  # the usual case
+        here, k, among = np.arange(len(rows)), rows, call.densities(call.value)
+    else:
+        position = call.positions(rows)
+        here, there = np.flatnonzero(position >= 0), range(0) if alone is None else alone.reached
+        among = call.densities(call.value)
+        if alone is None or list(here) != list(there):
+            left_out = np.setdiff1d(here, there)
+            if np.setdiff1d(there, here).size or (call.distribution is None and among[position[left_out]].any()):
+                raise InputError(
+                    f"{call.what} is not reached by the same particles among the others and alone", *_ALONE
+                )
+            return
+        if not len(here):
+            return
+        k = position[here]
     pairs = [(among, alone.densities(alone.value))]
     if call.distribution is not None and thorough:
         other = call.value[k[0] - 1]  # the value of another particle
