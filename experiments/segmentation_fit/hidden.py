@@ -26,7 +26,7 @@ from scipy.special import expit
 from mstfilter.base.files import read_csv, write_csv
 from mstfilter.lab.simulation import SCENE_FAMILIES
 from mstfilter.mst.segmentation import BorderTree, ColourDepthBoundary, ObjectRule
-from mstfilter.mst.segmentation.hidden import DISAGREEMENT, hidden_pairs, segments_of
+from mstfilter.mst.segmentation.hidden import DISAGREEMENT, hidden_pairs, likely_segments
 from mstfilter.scene import scene_cache
 
 HERE = Path(__file__).resolve().parent
@@ -48,7 +48,7 @@ def pairs_of(pause: Pause, tree: BorderTree) -> Iterator[tuple[float, ...]]:
     """Whether each pair of an image is different objects, and how it disagrees."""
     found = ObjectRule().foreground(pause.frame, pause.grid)
     regions = tree.regions(ColourDepthBoundary().boundary(found.frame), found.frame, found.pixels)
-    _, image, sums, _ = segments_of(tree.merges(regions), regions)
+    _, image, sums, _ = likely_segments(tree.merges(regions), regions)
     known = pause.image >= 0
     votes = np.zeros((len(sums), int(pause.image.max()) + 1))
     np.add.at(votes, (image[known], pause.image[known]), 1)

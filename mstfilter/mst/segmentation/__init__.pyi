@@ -15,17 +15,19 @@ from mstfilter.mst.segmentation.cuts import (
     optimal_cut as optimal_cut,
 )
 from mstfilter.mst.segmentation.learned_tree import (
-    EVIDENCE_FEATURES as EVIDENCE_FEATURES,
-    FEATURES as FEATURES,
-    PAIR_FEATURES as PAIR_FEATURES,
     Agglomeration as Agglomeration,
     BorderTree as BorderTree,
     LearnedTree as LearnedTree,
     MergedTree as MergedTree,
-    pair_features as pair_features,
     pair_log_odds as pair_log_odds,
 )
 from mstfilter.mst.segmentation.mh import MetropolisHastingsCuts as MetropolisHastingsCuts
+from mstfilter.mst.segmentation.pair_features import (
+    EVIDENCE_FEATURES as EVIDENCE_FEATURES,
+    FEATURES as FEATURES,
+    PAIR_FEATURES as PAIR_FEATURES,
+    pair_features as pair_features,
+)
 from mstfilter.mst.segmentation.proposal import (
     ObjectRule as ObjectRule,
     Segments as Segments,

@@ -21,8 +21,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mstfilter.mst.segmentation.boundary import filled_disparity
-from mstfilter.mst.segmentation.learned_tree import NO_BORDER, Merge, PairMeasures
+from mstfilter.mst.segmentation.pair_features import NO_BORDER, PairMeasures
 from mstfilter.mst.segmentation.regions import Regions
+from mstfilter.mst.segmentation.tree import Merge
 from mstfilter.scene import Frame, posed_camera, scaled_area, scaled_length
 
 #: What the disagreement of a pair is: the largest of these measurements, each in units of the number here. The misfit
@@ -165,7 +166,7 @@ def with_joins(merges: Sequence[Merge], regions: Regions, frame: Frame) -> list[
 
     Merges of segments keep their order and log odds. A join comes before the first merge with larger log odds.
     """
-    inside, image, sums, nodes = segments_of(merges, regions)
+    inside, image, sums, nodes = likely_segments(merges, regions)
     pairs, values = hidden_pairs(image, sums, frame)
     odds = SLOPE * (values.max(axis=1, initial=0.0) - EVEN)
     joins = sorted(
@@ -174,7 +175,9 @@ def with_joins(merges: Sequence[Merge], regions: Regions, frame: Frame) -> list[
     return _inserted(merges, len(regions.sums), inside, joins)
 
 
-def segments_of(merges: Sequence[Merge], regions: Regions) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[int]]:
+def likely_segments(
+    merges: Sequence[Merge], regions: Regions
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[int]]:
     """The most probable segments: the largest nodes of a tree in which no merge joins different objects.
 
     Returns whether each merge (m,) is inside a segment, the segment (H, W) of every pixel with 0 for the table, the

@@ -34,6 +34,9 @@ from mstfilter.base.fields import PositiveInt
 from mstfilter.base.results import Checked, check_type, returns
 from mstfilter.scene import Frame, content_key, read_only
 
+#: A merge of two nodes: their numbers, and the log odds of different objects against one.
+Merge = tuple[int, int, float]
+
 
 @dataclass(frozen=True, eq=False)
 class Tree:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from mstfilter.mst.segmentation import BorderTree, ColourDepthBoundary, hidden
-from mstfilter.mst.segmentation.hidden import DISAGREEMENT, _inserted, hidden_pairs, segments_of, with_joins
+from mstfilter.mst.segmentation.hidden import DISAGREEMENT, _inserted, hidden_pairs, likely_segments, with_joins
 from mstfilter.mst.segmentation.regions import REGION, Regions, measure_regions
 from mstfilter.scene import render
 from tests.mst.segmentation.scenes import GRID, boxes, camera, frame_of
@@ -107,7 +107,7 @@ def test_joins_keep_segments_and_every_region_has_one_way_up(seed):
     n = int(rng.integers(3, 14))
     merges = random_tree(rng, n)
     regions = Regions(np.arange(n)[None], np.ones((n, REGION["perimeter"].stop)), [{} for _ in range(n)])
-    inside, image, sums, nodes = segments_of(merges, regions)
+    inside, image, sums, nodes = likely_segments(merges, regions)
     assert sums[1:, 0].sum() == n - 1  # each region is in one segment
     s = len(nodes) - 1
     joins = sorted(
