@@ -14,7 +14,7 @@ does all this and completes the segments to 3-D shapes.
 `boundary`        boundary maps from colour and depth
 `tree`            the tree and its helpers; the ultrametric contour map
 `regions`         measurements of regions and of their borders
-`pair_features`   measurements of pairs of regions
+`pair_measures`   measurements of pairs of regions
 `learned_tree`    trees from learned log odds
 `border_network`  the trained network that corrects these log odds
 `hidden`          joins of segments on both sides of something nearer

@@ -22,7 +22,7 @@ from mstfilter.mst.segmentation.learned_tree import (
     pair_log_odds as pair_log_odds,
 )
 from mstfilter.mst.segmentation.mh import MetropolisHastingsCuts as MetropolisHastingsCuts
-from mstfilter.mst.segmentation.pair_features import (
+from mstfilter.mst.segmentation.pair_measures import (
     EVIDENCE_FEATURES as EVIDENCE_FEATURES,
     FEATURES as FEATURES,
     PAIR_FEATURES as PAIR_FEATURES,

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mstfilter.mst.segmentation.boundary import filled_disparity
-from mstfilter.mst.segmentation.pair_features import NO_BORDER, PairMeasures
+from mstfilter.mst.segmentation.pair_measures import NO_BORDER, PairMeasures
 from mstfilter.mst.segmentation.regions import Regions
 from mstfilter.mst.segmentation.tree import Merge
 from mstfilter.scene import Frame, posed_camera, scaled_area, scaled_length

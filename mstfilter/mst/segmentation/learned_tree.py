@@ -2,8 +2,8 @@
 
 Watershed regions of a boundary map are merged pair by pair, always the pair with the lowest log odds. These are
 linear in features of the border and of the union of the two regions (`pair_features`), which are recomputed when a
-region grows; `BorderTree` adds the correction of a small network (`PairNetwork`). The weights of the features are in a
-model file. They were fitted on simulated scenes only, the correction also on real frames.
+region grows; `BorderTree` adds the correction of a small network (`PairNetwork`). The weights of the features are in
+a model file. They were fitted on simulated scenes only, the correction also on real frames.
 
 >>> tree = LearnedTree().build(boundary, frame)
 >>> tree = BorderTree().build(boundary, frame)         # also with what a trained border network sees
@@ -28,7 +28,7 @@ from mstfilter.base.reading import read_json
 from mstfilter.base.resources import models_folder
 from mstfilter.base.trained import load_once
 from mstfilter.mst.segmentation.hidden import with_joins
-from mstfilter.mst.segmentation.pair_features import FEATURES, NO_BORDER, PAIR_FEATURES, pair_features
+from mstfilter.mst.segmentation.pair_measures import FEATURES, NO_BORDER, PAIR_FEATURES, pair_features
 from mstfilter.mst.segmentation.regions import REGION, Regions, SeenBorders, measure_regions, object_leaves
 from mstfilter.mst.segmentation.tree import Merge, Tree, TreeBuilder, UcmTree
 from mstfilter.scene import Frame, pixels_above_table, scaled_length

@@ -23,7 +23,7 @@ import numpy as np
 
 from mstfilter.mst.segmentation.boundary import filled_disparity
 from mstfilter.mst.segmentation.divisions import KINDS, Division, SeamImage
-from mstfilter.mst.segmentation.pair_features import FEATURES, pair_features
+from mstfilter.mst.segmentation.pair_measures import FEATURES, pair_features
 from mstfilter.mst.segmentation.regions import BORDER_SIGN, REGION, border_terms, edge_maps, pixel_terms
 from mstfilter.scene import scaled_length
 

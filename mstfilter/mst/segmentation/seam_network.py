@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mstfilter.base.trained import TrainedModel, calibrated_network, layer_size, load_once, one_thread, open_model
-from mstfilter.mst.segmentation.pair_features import FEATURES
+from mstfilter.mst.segmentation.pair_measures import FEATURES
 from mstfilter.mst.segmentation.seam_measures import SEAM_FEATURES, STRIP, STRIP_CHANNELS
 
 SEAM_ARCHITECTURE = "seam-judge"

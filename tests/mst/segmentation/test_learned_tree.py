@@ -26,7 +26,7 @@ from mstfilter.mst.segmentation import (
 )
 from mstfilter.mst.segmentation.border_network import BORDER_ARCHITECTURE, IMAGE_CHANNELS, BorderNet
 from mstfilter.mst.segmentation.learned_tree import Agglomeration, tree_of_merges
-from mstfilter.mst.segmentation.pair_features import quadric_residual
+from mstfilter.mst.segmentation.pair_measures import quadric_residual
 from mstfilter.mst.segmentation.regions import BORDER, REGION, measure_regions, object_leaves
 from mstfilter.scene import Camera, Frame, pixels_above_table, render
 from tests.mst.segmentation.scenes import GRID, TOUCHING, TWO, camera, frame_of

@@ -13,7 +13,7 @@ from mstfilter.base.errors import InputError
 from mstfilter.base.trained import write_model
 from mstfilter.mst.segmentation import ColourDepthBoundary, MergeLogOdds, SeamTree, SeenBorders, optimal_cut
 from mstfilter.mst.segmentation.divisions import SeamImage, TreePart, divisions
-from mstfilter.mst.segmentation.pair_features import FEATURES, pair_features
+from mstfilter.mst.segmentation.pair_measures import FEATURES, pair_features
 from mstfilter.mst.segmentation.regions import measure_regions
 from mstfilter.mst.segmentation.seam_measures import SEAM_FEATURES, STRIP, STRIP_CHANNELS, SeamMeasures
 from mstfilter.mst.segmentation.seam_network import INPUTS, SEAM_ARCHITECTURE, SeamNet
