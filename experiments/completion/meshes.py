@@ -188,20 +188,23 @@ def read(path: Path) -> list[MeshSample]:
         return [MeshSample(**{name: z[f"{name}_{i}"] for name in MeshSample.__dataclass_fields__}) for i in range(n)]
 
 
-def predictions(completer: Completer, samples: Sequence[MeshSample], path: Path) -> tuple[list[np.ndarray], float]:
-    """Probabilities of a scene's samples, 0 in free space, and milliseconds a mask; from the file if it exists."""
+def opinions(
+    completer: Completer, samples: Sequence[MeshSample], path: Path
+) -> tuple[list[tuple[np.ndarray, float]], float]:
+    """`Completer.opinions` of a scene's samples, 0 in free space, and milliseconds a mask; from the file if there."""
     if path.exists():
         with np.load(path) as z:
-            return [z[f"p_{k}"].astype(np.float32) for k in range(len(samples))], float(z["ms"])
+            found = [z[f"p_{k}"].astype(np.float32) for k in range(len(samples))]
+            return list(zip(found, z["factor"].tolist(), strict=True)), float(z["ms"])
     boxes, rng = [one.box() for one in samples], np.random.default_rng(0)
     began = time.process_time()
-    found = completer.fill_many([rng] * len(boxes), boxes)
+    found, factor = zip(*completer.opinions([rng] * len(boxes), boxes), strict=True)
     ms = 1000 * (time.process_time() - began) / len(samples)
     found = [np.where(box.free, 0, p).astype(np.float16) for box, p in zip(boxes, found, strict=True)]
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as partial, partial.open("wb") as file:
-        np.savez_compressed(file, ms=ms, **{f"p_{k}": p for k, p in enumerate(found)})
-    return [p.astype(np.float32) for p in found], ms
+        np.savez_compressed(file, ms=ms, factor=factor, **{f"p_{k}": p for k, p in enumerate(found)})
+    return opinions(completer, samples, path)
 
 
 def surface_distances(p: np.ndarray, surface: np.ndarray) -> tuple[float, float]:
@@ -254,20 +257,21 @@ def score(out: Path, results: Path) -> None:
         "posterior": Posterior(),
     }
     samples: list[MeshSample] = []
-    found: dict[str, list[np.ndarray]] = {name: [] for name in completers}
+    said: dict[str, list[tuple[np.ndarray, float]]] = {name: [] for name in completers}
     ms: dict[str, list[float]] = {name: [] for name in completers}
     for path in sorted(out.glob("*.npz")):
         of_scene = read(path)
         samples += of_scene
         for name, completer in completers.items():
-            p, cost = predictions(completer, of_scene, out / name / path.name)
-            found[name] += p
+            of_all, cost = opinions(completer, of_scene, out / name / path.name)
+            said[name] += of_all
             ms[name] += [cost] * len(of_scene)
-    weights = np.array(Pooled().weights) / sum(Pooled().weights)
-    pairs = zip(found["network"], found["posterior"], strict=True)
-    found["pooled"] = [weights[0] * a + weights[1] * b for a, b in pairs]
+    found = {name: [p for p, _ in of_all] for name, of_all in said.items()}
+    pairs = zip(said["posterior"], found["extrude"], strict=True)
+    found["posterior"] = [fits * p + (1 - fits) * otherwise for (p, fits), otherwise in pairs]
+    found["pooled"] = [Pooled().mean(both) for both in zip(said["network"], said["posterior"], strict=True)]
     ms["pooled"] = [a + b for a, b in zip(ms["network"], ms["posterior"], strict=True)]
-    for name, log_odds in (("network", NetworkCompleter().log_odds), ("pooled", Pooled().log_odds)):
+    for name, log_odds in (("network", NetworkCompleter().log_odds), ("pooled", 0.2)):
         if log_odds:
             found[f"{name}, as in mst"] = [shifted(p, log_odds) for p in found[name]]
             ms[f"{name}, as in mst"] = ms[name]

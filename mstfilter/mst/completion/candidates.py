@@ -1,7 +1,7 @@
 """Where the bounding box of an object can be, given what was seen of it.
 
->>> evidence = Evidence.of(seen)
->>> groups = groups_of(evidence, kinds)                    # each kind in each frame that it can have
+>>> evidence = ShapeEvidence.of(seen)
+>>> groups = shape_groups(evidence, kinds)                    # each kind in each frame that it can have
 >>> boxes = groups.boxes(group, u)                         # group (n,), u (d, n) standard normal: n candidates
 
 `mstfilter.mst.completion.posterior` says what frames and candidates are.
@@ -25,6 +25,7 @@ _LEAST_PART = 0.12  # of the visible surface, of parts that are not connected to
 _BESIDE = 2  # voxels around the object and its shadow, in which space is asked whether it is free
 _POSE, _ENDS = 3, 6  # numbers for the pose and the ends of a box
 _TIGHT = 0.003  # metres, standard deviation of the end of a box about the end of the readings
+_OPEN = 0.3  # an open end grows where u exceeds minus this number
 _TYPICAL = 0.08  # metres, extent of an object of which little is seen
 _SHRINK = 0.3  # of the extent, of a box without a handle that sticks out of it
 _HIGH = 0.025  # metres above the table: an object seen only above may stand on something
@@ -35,7 +36,7 @@ _FEW = 8  # readings, with which no object is seen to lean
 _ALIKE = np.deg2rad(7.0)  # frames that differ by less are one
 
 
-class Evidence(NamedTuple):
+class ShapeEvidence(NamedTuple):
     """What is known of an object, as points in metres in the box: x, y from its corner, z above the table."""
 
     voxel: float  #: edge of a voxel
@@ -58,7 +59,7 @@ class Evidence(NamedTuple):
     size: float  #: typical extent in metres: the mean of the two largest visible ones
 
     @classmethod
-    def of(cls, seen: ObservedBox) -> Evidence:
+    def of(cls, seen: ObservedBox) -> ShapeEvidence:
         """Raises IndexError if there is no visible surface."""
         rng = np.random.default_rng(0)
         voxel = float(seen.height[1] - seen.height[0]) if len(seen.height) > 1 else 0.01
@@ -96,9 +97,13 @@ class Evidence(NamedTuple):
             float(np.sort(np.ptp(own, axis=0))[1:].mean()),
         )
 
-    def openness(self, axis: np.ndarray, near: np.ndarray) -> float:
-        """Share of the places one voxel beyond some readings (k, 3), along `axis` (3,), that are not seen free."""
-        index = np.floor((near + 1.3 * self.voxel * axis) / self.voxel).astype(int)
+    def openness(self, axis: np.ndarray, end: float) -> float:
+        """Share of the places beyond the end of the readings along `axis` (3,), at `end` metres, not seen free.
+
+        Each place is a voxel beyond the end, in line with a reading: a bottle ends at its neck, but not its body.
+        """
+        beyond = self.own + (end + 1.3 * self.voxel - self.own @ axis)[:, None] * axis
+        index = np.floor(beyond / self.voxel).astype(int)
         inside = ((index >= 0) & (index < self.free_voxels.shape)).all(axis=1)
         open_ = index[:, 2] >= 0
         open_[inside] &= ~self.free_voxels[tuple(index[inside].T)]
@@ -162,7 +167,7 @@ class Groups(NamedTuple):
         axes, ends = self.axes[group].transpose(1, 2, 0), self.ends[group].transpose(1, 2, 0)
         growth, support, upright = self.growth[group].transpose(1, 2, 0), self.support[group], self.upright[group]
         ends_u = u[:_ENDS].reshape(2, 3, -1)
-        out = _TIGHT * ends_u + growth * np.maximum(ends_u + 0.3, 0)
+        out = _TIGHT * ends_u + growth * np.maximum(ends_u + _OPEN, 0)
         out -= _SHRINK * (ends[1] - ends[0]) * np.maximum(-ends_u - 1.2, 0)
         low, high = ends[0] - out[0], ends[1] + out[1]
         low[2] = np.where(upright, support + 0.5 * _TIGHT * ends_u[0, 2], low[2])
@@ -207,7 +212,7 @@ class Boxes(NamedTuple):
         return found
 
 
-def groups_of(evidence: Evidence, kinds: Sequence[ShapeKind]) -> Groups:
+def shape_groups(evidence: ShapeEvidence, kinds: Sequence[ShapeKind]) -> Groups:
     """Each kind in each frame that it can have."""
     upright, leaning = _frames(evidence)
     vertical = np.array([0.0, 0.0, 1.0])
@@ -233,21 +238,22 @@ def groups_of(evidence: Evidence, kinds: Sequence[ShapeKind]) -> Groups:
     return Groups(kind_of, prior / prior.sum(), axes, support, standing_up, is_round, place, growth, facing)
 
 
-def _ends(evidence: Evidence, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _ends(evidence: ShapeEvidence, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Ends (2, 3) of the readings along the axes of a frame, and how far each end can grow (2, 3), in metres."""
     along = evidence.own @ axes
     ends = np.sort(along, axis=0)[[len(along) // 100, -1 - len(along) // 100]]
-    extent, growth = ends[1] - ends[0], np.zeros((2, 3))
-    reach = np.maximum(0.15 * extent, 0.5 * evidence.voxel)
-    for end, sign in enumerate((-1.0, 1.0)):
-        near = sign * (along - ends[end]) > -reach
-        for axis in range(3):
-            growth[end, axis] = evidence.openness(sign * axes[:, axis], evidence.own[near[:, axis]])
+    extent = ends[1] - ends[0]
+    growth = np.array(
+        [
+            [evidence.openness(sign * a, sign * e) for a, e in zip(axes.T, side, strict=True)]
+            for sign, side in ((-1, ends[0]), (1, ends[1]))
+        ]
+    )
     typical = max(evidence.size, _TYPICAL)
     return ends, growth * np.maximum(typical - extent, 0.4 * typical)
 
 
-def _frames(evidence: Evidence) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def _frames(evidence: ShapeEvidence) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Axes (3, 3) of boxes that stand on a horizontal side, and of boxes that lean."""
     normal, own = evidence.normal, evidence.own
     angles = [_least_rectangle(own[:, :2])]
@@ -298,7 +304,7 @@ def _leaning(own: np.ndarray, main: np.ndarray) -> np.ndarray:
     return np.stack([np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x, main], axis=1)
 
 
-def _about(evidence: Evidence, axis: np.ndarray) -> np.ndarray:
+def _about(evidence: ShapeEvidence, axis: np.ndarray) -> np.ndarray:
     """Axes (3, 3) whose third one is `axis` (3,) and whose first one is across the line of sight."""
     x = np.cross(axis, evidence.to_camera)
     if np.linalg.norm(x) < 0.05:
@@ -307,7 +313,7 @@ def _about(evidence: Evidence, axis: np.ndarray) -> np.ndarray:
     return np.stack([x, np.cross(axis, x), axis], axis=1)
 
 
-def _supports(evidence: Evidence) -> list[tuple[float, float]]:
+def _supports(evidence: ShapeEvidence) -> list[tuple[float, float]]:
     """Heights on which the object may rest, with prior weights: the table, a surface below it, its lowest reading."""
     lowest = float(np.percentile(evidence.own[:, 2], 2))
     if lowest < _HIGH:

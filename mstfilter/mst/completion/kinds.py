@@ -47,6 +47,7 @@ class ShapeKind(Bounded, ABC):
     #: Whether cross-sections are circles about the third axis. The third axis can then point anywhere; the shapes of
     #: other kinds stand on any side.
     round: ClassVar[bool] = False
+    foot: ClassVar[float] = 1.0  #: width of what the shape stands on, as a share of the width of its box
     lies: ClassVar[float] = 1.0  #: how readily the shape lies on its side or leans, compared with a solid
 
     @abstractmethod
@@ -118,6 +119,8 @@ class TurnedKind(ShapeKind):
 class EllipsoidKind(ShapeKind):
     """Ellipsoids."""
 
+    foot: ClassVar[float] = 0.25
+
     def distance(self, half: np.ndarray, shape: np.ndarray, x: np.ndarray) -> np.ndarray:
         first = second = 0.0
         for k in range(3):
@@ -138,6 +141,7 @@ class SuperquadricKind(ShapeKind):
 
     def distance(self, half: np.ndarray, shape: np.ndarray, x: np.ndarray) -> np.ndarray:
         p, q = (2 * 4 ** shape[k] for k in range(2))
+        q = np.where(x[2] < 0, 8.0, q)  # what stands has a flat bottom
         scaled = [np.maximum(np.abs(x[k]) / half[k], 1e-3) for k in range(3)]
         a, b = _power(scaled[0], p), _power(scaled[1], p)
         across = a + b

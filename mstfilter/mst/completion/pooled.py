@@ -32,7 +32,8 @@ class Pooled(OnLattice, UsesFiles):
     completers : tuple of Completer
         Completers whose result is the same whenever it is asked for. Their own `log_odds` are not used.
     weights : tuple of float
-        A weight at least 0 for each completer. Only their ratios count.
+        A weight at least 0 for each completer. Only their ratios count. For each object, they are multiplied by the
+        factors of `Completer.opinions`: a `Posterior` does not count for an object that fits none of its kinds.
     """
 
     completers: tuple[Completer, ...] = (NetworkCompleter(), Posterior())
@@ -67,6 +68,12 @@ class Pooled(OnLattice, UsesFiles):
         return self.fill_many([rng], [seen])[0]
 
     def fill_many(self, rngs: Sequence[np.random.Generator], seen: Sequence[ObservedBox]) -> list[np.ndarray]:
-        share = np.array(self.weights, np.float32) / np.float32(sum(self.weights))
-        answers = [one.fill_many(rngs, seen) for one in self.completers]
-        return [sum(s * p for s, p in zip(share, of_box, strict=True)) for of_box in zip(*answers, strict=True)]
+        answers = [one.opinions(rngs, seen) for one in self.completers]
+        return [self.mean(of_box) for of_box in zip(*answers, strict=True)]
+
+    def mean(self, opinions: Sequence[tuple[np.ndarray, float]]) -> np.ndarray:
+        """The mean (a, b, c) of the completers' probabilities of one object, each with its factor."""
+        share = np.array(self.weights) * [factor for _, factor in opinions]
+        share = share if share.sum() > 0 else np.array(self.weights)
+        mean = sum(s * p for s, (p, _) in zip(share / share.sum(), opinions, strict=True))
+        return np.asarray(mean, np.float32)

@@ -16,7 +16,7 @@ The log likelihood of a candidate has four terms:
     - n_eff * mean(rho(distance of the object's readings from the surface / sigma))     heavy tails
     - penalty * (volume in voxels that are observed as free)
     - penalty * (volume in voxels of another surface)
-    - rho(distance of the lowest point from the support)
+    - rho(distance of the lowest point from the support), or a penalty for what would hardly stand on its foot
 
 Readings that are near each other have errors in common, above all that of the shape itself, which is never quite a
 cylinder. So n_eff is far below the number of readings: the likelihood is tempered.
@@ -30,6 +30,7 @@ numbers, u' = sqrt(1 - s^2) u + s e, which leaves the prior invariant, so the li
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -37,7 +38,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from mstfilter.base.fields import NonNegativeFloat, PositiveFloat, PositiveInt, Share
-from mstfilter.mst.completion.candidates import Boxes, Evidence, Groups, groups_of, in_metres
+from mstfilter.mst.completion.candidates import Boxes, Groups, ShapeEvidence, in_metres, shape_groups
 from mstfilter.mst.completion.extrude import Extrude
 from mstfilter.mst.completion.kinds import (
     BoxKind,
@@ -52,7 +53,7 @@ from mstfilter.mst.completion.kinds import (
 from mstfilter.mst.completion.lattice import OnLattice
 from mstfilter.mst.completion.observed import ObservedBox
 
-KINDS = (
+SHAPE_KINDS = (
     BoxKind(share=3.0),
     CylinderKind(share=2.0),
     ConeKind(),
@@ -62,12 +63,14 @@ KINDS = (
     VesselKind(),
 )
 
+# What stands has a foot at least a quarter as wide as it is high; log likelihood lost for each factor e of less.
+_SLENDER, _STABLE = 0.25, 3.0
 _REST = 0.004  # metres, standard deviation of the lowest point about the support
 # Metres. Readings are compared this far outside of the surface, so the wrong side of a wall does not explain them.
 _OUTSIDE = 0.003
 _NO_FIT = 1.2  # residual of all readings, in standard deviations, from which "no kind fits" is more likely
 _TAIL = 4.0  # degrees of freedom of the residuals
-_NEVER = 1e-3  # probability of "no kind fits" that is too small to extrude the object
+_CERTAIN = 0.999  # probability that a kind fits, from which the object is not extruded too
 # Fitted to meshes of the tuning pool: depth in voxels behind the measured surface, and the share of such voxels that
 # are occupied although no shape reaches there; the factor of this share in parts of the mask that may show other
 # things; mean and standard deviation of the depth, in voxels, at which the object begins.
@@ -105,7 +108,7 @@ class Posterior(OnLattice):
         Prior weight of the answer that no kind fits; the shape is then extruded.
     """
 
-    kinds: tuple[ShapeKind, ...] = KINDS
+    kinds: tuple[ShapeKind, ...] = SHAPE_KINDS
     n: PositiveInt = 256
     sigma: PositiveFloat = 0.003
     misfit: NonNegativeFloat = 0.015
@@ -116,11 +119,19 @@ class Posterior(OnLattice):
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
         """Posterior mean of the occupancy (a, b, c). It draws no number of `rng`, so an object has one answer."""
-        if not seen.surface.any():
-            return np.zeros(seen.surface.shape, np.float32)
-        drawn = self.sample(np.random.default_rng(0), seen)
-        other = drawn.other_shape
-        return drawn.occupancy() * (1 - other) + (other * Extrude().fill(rng, seen) if other > _NEVER else 0)
+        [(p, fits)] = self.opinions([rng], [seen])
+        return p if fits > _CERTAIN else fits * p + (1 - fits) * Extrude().fill(rng, seen)
+
+    def opinions(
+        self, rngs: Sequence[np.random.Generator], seen: Sequence[ObservedBox]
+    ) -> list[tuple[np.ndarray, float]]:
+        """The mean occupancy under the kinds, and the probability that one of them fits."""
+        found = []
+        for one in seen:
+            drawn = self.sample(np.random.default_rng(0), one) if one.surface.any() else None
+            empty = np.zeros(one.surface.shape, np.float32), 0.0
+            found.append(empty if drawn is None else (drawn.occupancy(), 1 - drawn.other_shape))
+        return found
 
     def draw(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
         """Occupancy (a, b, c) of one shape of the posterior."""
@@ -133,8 +144,8 @@ class Posterior(OnLattice):
 
     def sample(self, rng: np.random.Generator, seen: ObservedBox) -> ShapeSamples:
         """Samples of the posterior, of equal weight. `seen` has visible surface."""
-        evidence = Evidence.of(seen)
-        groups = groups_of(evidence, self.kinds)
+        evidence = ShapeEvidence.of(seen)
+        groups = shape_groups(evidence, self.kinds)
         count = np.maximum(np.rint(_FIRST * self.n * groups.prior), _LEAST_GROUP).astype(int)
         group = np.repeat(np.arange(len(count)), count)
         log_w = np.log(groups.prior / count)[group]
@@ -166,7 +177,9 @@ class Posterior(OnLattice):
         boxes = groups.boxes(group, u)
         return ShapeSamples(self.kinds, groups.kind[group], boxes, float(other), evidence, seen)
 
-    def _log_likelihoods(self, evidence: Evidence, groups: Groups, group: np.ndarray, u: np.ndarray) -> np.ndarray:
+    def _log_likelihoods(
+        self, evidence: ShapeEvidence, groups: Groups, group: np.ndarray, u: np.ndarray
+    ) -> np.ndarray:
         """Log likelihood (n,) of candidates u (d, n) of groups (n,)."""
         order = np.argsort(groups.kind[group], kind="stable")  # a slice of candidates for each kind
         kinds, group = groups.kind[group][order], group[order]
@@ -175,10 +188,12 @@ class Posterior(OnLattice):
             part = slice(*np.searchsorted(kinds, (k, k + 1)))
             found[order[part]] = self._log_likelihood(evidence, self.kinds[k], boxes.take(part))
         off = (boxes.lowest(groups.round[group]) - groups.support[group]) / _REST
-        found[order] -= np.where(groups.upright[group], 0, (_TAIL + 1) / 2 * np.log1p(off**2 / _TAIL))
+        foot = np.array([kind.foot for kind in self.kinds])[kinds] * boxes.half[:2].min(axis=0)
+        narrow = np.maximum(np.log(_SLENDER * boxes.half[2] / foot), 0)
+        found[order] -= np.where(groups.upright[group], _STABLE * narrow, (_TAIL + 1) / 2 * np.log1p(off**2 / _TAIL))
         return found
 
-    def _log_likelihood(self, evidence: Evidence, kind: ShapeKind, boxes: Boxes) -> np.ndarray:
+    def _log_likelihood(self, evidence: ShapeEvidence, kind: ShapeKind, boxes: Boxes) -> np.ndarray:
         points = np.concatenate([evidence.own + _OUTSIDE * evidence.normal, evidence.free, evidence.other])
         distance = kind.distance(boxes.half, boxes.shape, boxes.local(points))
         n_own, n_free = len(evidence.own), len(evidence.free)
@@ -189,7 +204,7 @@ class Posterior(OnLattice):
         found -= self.penalty * evidence.weight_free * volume[:n_free].sum(axis=0)
         return np.asarray(found - self.penalty * evidence.weight_other * volume[n_free:].sum(axis=0))
 
-    def _log_of_residuals(self, evidence: Evidence, residual: np.ndarray) -> np.ndarray:
+    def _log_of_residuals(self, evidence: ShapeEvidence, residual: np.ndarray) -> np.ndarray:
         n = min(self.tempering * evidence.n_surface, self.most_readings)
         return np.asarray(-n * (_TAIL + 1) / 2 * np.log1p(residual**2 / _TAIL).mean(axis=0))
 
@@ -211,7 +226,7 @@ class ShapeSamples:
     kind: np.ndarray  #: (n,) index of the kind of each sample
     boxes: Boxes
     other_shape: float  #: probability that no kind fits
-    evidence: Evidence
+    evidence: ShapeEvidence
     seen: ObservedBox
 
     def take(self, index: np.ndarray) -> ShapeSamples:
