@@ -48,6 +48,7 @@ CLIPPED = (
 )
 ASKED = 0.02  # a voxel is in question if it is on or behind the mask's surface, or some completer gives it as much
 NEAR = 0.005  # metres, for the share of the surface that is right
+_STEPS = np.argwhere(np.ones((3, 3, 3)))[14:] - 1  # to half of the neighbours of a voxel
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,22 +211,24 @@ def opinions(
 def surface_distances(p: np.ndarray, surface: np.ndarray) -> tuple[float, float]:
     """Mean distance in mm between the true and the estimated surface, and the share that is within 5 mm.
 
-    The estimated surface is where p crosses one half between neighbouring voxels, by linear interpolation. Both
-    values are means of the two directions.
+    The estimated surface is where p crosses one half on the way to one of the 26 neighbours of a voxel, by linear
+    interpolation. Both values are means of the two directions, and distances are to the nearest point: the spacing of
+    the points (4 mm of the estimated surface, more of the true one of large objects) adds 1 to 4 mm for all alike.
     """
     padded = np.pad(p, 1)
-    points = []
-    for axis in range(3):
-        a, b = (np.moveaxis(padded, axis, 0)[part] for part in (slice(None, -1), slice(1, None)))
+    found = []
+    for step in _STEPS:
+        here = tuple(slice(max(-d, 0), n - max(d, 0)) for d, n in zip(step, padded.shape, strict=True))
+        there = tuple(slice(max(d, 0), n - max(-d, 0)) for d, n in zip(step, padded.shape, strict=True))
+        a, b = padded[here], padded[there]
         index = np.argwhere((a >= 0.5) != (b >= 0.5))
         first, second = a[tuple(index.T)], b[tuple(index.T)]
-        place = index.astype(float)
-        place[:, 0] += (0.5 - first) / (second - first)
-        points.append(np.insert(place[:, 1:], axis, place[:, 0], axis=1) if axis else place)
-    found = (np.concatenate(points) - 0.5) * LATTICE  # the padding is a voxel, and centres are at one half
-    if not len(found):
+        start = index + [one.start for one in here]
+        found.append(start + ((0.5 - first) / (second - first))[:, None] * step)
+    points = (np.concatenate(found) - 0.5) * LATTICE  # the padding is a voxel, and centres are at one half
+    if not len(points):
         return np.nan, 0.0
-    there, back = cKDTree(found).query(surface)[0], cKDTree(surface).query(found)[0]
+    there, back = cKDTree(points).query(surface)[0], cKDTree(surface).query(points)[0]
     return 500 * float(there.mean() + back.mean()), float((there < NEAR).mean() + (back < NEAR).mean()) / 2
 
 

@@ -74,6 +74,7 @@ _CERTAIN = 0.999  # probability that a kind fits, from which the object is not e
 # Fitted to meshes of the tuning pool: depth in voxels behind the measured surface, and the share of such voxels that
 # are occupied although no shape reaches there; the factor of this share in parts of the mask that may show other
 # things; mean and standard deviation of the depth, in voxels, at which the object begins.
+_DEEP = 0.7  # voxels behind the readings, where a thin wall has ended
 _LAYER, _ASIDE, _FRONT = ((0.5, 0.65, 1.0, 1.4), (0.85, 0.75, 0.55, 0.45)), 0.6, (-0.05, 0.2)
 _LEAST_GROUP = 6  # candidates of each kind and frame
 _STAGES = 20  # at most
@@ -238,7 +239,8 @@ class ShapeSamples:
 
         The occupancy of a voxel is the share of it that is inside, by the distance of its centre from the surface.
         Whatever the shape, a layer behind the readings belongs to the object, and what lies in front of them does
-        not: `_LAYER`, `_FRONT`.
+        not: `_LAYER`, `_FRONT`. A wall thinner than a voxel fills the voxels whose centres are within half a voxel of
+        its middle (`mstfilter.lab.simulation.shapes`), so it begins in front of the readings and ends soon behind.
         """
         p, voxel, evidence = np.zeros(self.seen.surface.shape, np.float32), self.evidence.voxel, self.evidence
         reach = np.abs(self.boxes.axes * self.boxes.half).sum(axis=1) + voxel
@@ -249,15 +251,19 @@ class ShapeSamples:
         index, points, n = index[near], points[near], len(self.kind)
         kept = int(np.clip(_MOST_DISTANCES // max(len(points), 1), 8, n))
         drawn = self.take(np.arange(0, n, -(-n // kept)))
-        total = np.zeros(len(points), np.float32)
+        total, thinness = np.zeros(len(points), np.float32), 0.0
         for k in np.unique(drawn.kind):
             kind, boxes = self.kinds[k], drawn.boxes.take(np.flatnonzero(drawn.kind == k))
             distance = kind.distance(boxes.half, boxes.shape, boxes.local(points))
-            total += np.clip(0.5 + (_thin(kind, boxes, voxel) - distance) / voxel, 0, 1).sum(axis=1)
+            thin = _thin(kind, boxes, voxel)
+            total += np.clip(0.5 + (thin - distance) / voxel, 0, 1).sum(axis=1)
+            thinness += float(thin.sum()) / voxel / len(drawn.kind)  # 0 solid .. 1/2 a sheet
         p[tuple(index.T)] = total / len(drawn.kind)
-        layer = np.interp(evidence.depth, *_LAYER) * np.where(evidence.main, 1, _ASIDE)
+        depth = evidence.depth
+        layer = np.interp(depth, *_LAYER) * np.where(evidence.main, 1, _ASIDE)
+        layer *= np.where(depth > _DEEP, 1 - 2 * thinness, 1)
         at = tuple(evidence.layer.T)
-        p[at] = np.maximum(p[at], layer) * ndtr((evidence.depth - _FRONT[0]) / _FRONT[1])
+        p[at] = np.maximum(p[at], layer) * ndtr((depth - _FRONT[0] + thinness) / _FRONT[1])
         return p
 
 
