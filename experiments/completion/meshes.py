@@ -274,10 +274,9 @@ def score(out: Path, results: Path) -> None:
     found["posterior"] = [fits * p + (1 - fits) * otherwise for (p, fits), otherwise in pairs]
     found["pooled"] = [Pooled().mean(both) for both in zip(said["network"], said["posterior"], strict=True)]
     ms["pooled"] = [a + b for a, b in zip(ms["network"], ms["posterior"], strict=True)]
-    for name, log_odds in (("network", NetworkCompleter().log_odds), ("pooled", 0.2)):
-        if log_odds:
-            found[f"{name}, as in mst"] = [shifted(p, log_odds) for p in found[name]]
-            ms[f"{name}, as in mst"] = ms[name]
+    for name in ("network", "pooled"):
+        found[f"{name}, shifted"] = [shifted(p, NetworkCompleter().log_odds) for p in found[name]]
+        ms[f"{name}, shifted"] = ms[name]
     asked = [
         ~Seen.FREE.among(one.bits) & ((Seen.SURFACE | Seen.BEHIND).among(one.bits) | (np.max(p, axis=0) > ASKED))
         for one, *p in zip(samples, *found.values(), strict=True)
