@@ -76,6 +76,7 @@ _CERTAIN = 0.999  # probability that a kind fits, from which the object is not e
 # things; mean and standard deviation of the depth, in voxels, at which the object begins.
 _DEEP = 0.7  # voxels behind the readings, where a thin wall has ended
 _LAYER, _ASIDE, _FRONT = ((0.5, 0.65, 1.0, 1.4), (0.85, 0.75, 0.55, 0.45)), 0.6, (-0.05, 0.2)
+_MOSTLY = 0.6  # of the surface of all views, that the latest one shows if the others are left out
 _LEAST_GROUP = 6  # candidates of each kind and frame
 _STAGES = 20  # at most
 _FIRST = 2  # candidates of the first stage, in units of `n`
@@ -144,7 +145,14 @@ class Posterior(OnLattice):
         return drawn.take(rng.integers(self.n, size=1)).occupancy()
 
     def sample(self, rng: np.random.Generator, seen: ObservedBox) -> ShapeSamples:
-        """Samples of the posterior, of equal weight. `seen` has visible surface."""
+        """Samples of the posterior, of equal weight. `seen` has visible surface.
+
+        Earlier views count if they show much that the latest frame does not. A view that moved with the object is off
+        by up to half a voxel, more than the readings, and the errors of its readings are alike.
+        """
+        latest = seen.latest
+        if latest is not None and latest.surface.sum() >= _MOSTLY * seen.surface.sum():
+            seen = latest
         evidence = ShapeEvidence.of(seen)
         groups = shape_groups(evidence, self.kinds)
         count = np.maximum(np.rint(_FIRST * self.n * groups.prior), _LEAST_GROUP).astype(int)

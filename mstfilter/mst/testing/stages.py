@@ -194,12 +194,14 @@ def _estimated(
 
 def _mirrored(box: ObservedBox) -> ObservedBox:
     """The box with its first axis reversed."""
-    return replace(box, **{f.name: getattr(box, f.name)[::-1] for f in fields(box) if f.name != "height"})
+    return replace(
+        box, **{f.name: getattr(box, f.name)[::-1] for f in fields(box) if f.name not in ("height", "latest")}
+    )
 
 
 def _cropped(box: ObservedBox, a: int, b: int, c: int) -> ObservedBox:
     """The first ``a x b x c`` voxels of a box."""
-    parts = {f.name: getattr(box, f.name)[:a, :b, :c] for f in fields(box) if f.name != "height"}
+    parts = {f.name: getattr(box, f.name)[:a, :b, :c] for f in fields(box) if f.name not in ("height", "latest")}
     return ObservedBox(**parts, height=box.height[:c])
 
 

@@ -195,6 +195,19 @@ def test_without_evidence_the_samples_are_those_of_the_prior():
     assert abs(share - 0.75) < 5 * np.sqrt(0.75 * 0.25 / 1000)
 
 
+def test_views_count_if_they_show_much_that_the_latest_frame_does_not():
+    """A view that adds little, with the errors of its motion, changes nothing; one of a hidden object is used."""
+    _, seen = seen_of(cast(0.055, 0.12)[0])
+    off = replace(
+        seen, surface=seen.surface | np.roll(seen.surface, 1, axis=0), signed=seen.signed - 0.4, latest=seen
+    )
+    assert off.surface.sum() < seen.surface.sum() / 0.6
+    assert np.array_equal(QUICK.fill(RNG, off), QUICK.fill(RNG, seen))
+    nothing = np.zeros_like(seen.surface)
+    hidden = replace(seen, latest=replace(seen, surface=nothing, points=nothing * 0))
+    assert np.array_equal(QUICK.fill(RNG, hidden), QUICK.fill(RNG, seen))
+
+
 def test_tiny_and_empty_boxes():
     nothing = np.zeros((3, 3, 3), bool)
     empty = ObservedBox(nothing * 0, *[nothing] * 5, nothing * 0.0, np.arange(3) * 0.01 + 0.005)
