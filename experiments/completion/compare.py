@@ -18,7 +18,7 @@ from hilbert_map import HilbertMap
 
 from mstfilter.base.files import write_csv
 from mstfilter.base.resources import training_program
-from mstfilter.mst.completion import Completer, Extrude, Hull, NetworkCompleter, SurfaceOnly
+from mstfilter.mst.completion import Completer, Extrude, Hull, NetworkCompleter, Pooled, Posterior, SurfaceOnly
 from mstfilter.scoring.statistics import interval
 
 HELD_OUT = training_program("shapes").HELD_OUT
@@ -50,7 +50,9 @@ def main() -> None:
         "extrude": Extrude(),
         "hull": Hull(),
         "hilbert_map": HilbertMap(),
-        "network": NetworkCompleter(weights=str(chosen.trained), log_odds=0.0),
+        "network": (network := NetworkCompleter(weights=str(chosen.trained), log_odds=0.0)),
+        "posterior": Posterior(),
+        "pooled": Pooled(completers=(network, Posterior())),
     }
     everything = np.ones(len(samples), bool)
     groups = {"all": everything}

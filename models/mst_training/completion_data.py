@@ -87,7 +87,7 @@ def _view_samples(rng: np.random.Generator, world: PhysicsWorld, index: int) -> 
     earlier = _earlier_frames(rng, world)
     alone = _silhouettes(world, camera, instance)
     rows = []
-    for mask in _masks(rng, frame, instance):
+    for mask in draw_masks(rng, frame, instance, _GRID, _N_MASKS):
         found = _sample(rng, frame, instance, mask, truth, earlier)
         if found is not None:
             which, bits, signed, shape, k = found
@@ -159,8 +159,10 @@ def _silhouettes(world: PhysicsWorld, camera: Camera, instance: np.ndarray) -> d
     return shares
 
 
-def _masks(rng: np.random.Generator, frame: Frame, instance: np.ndarray) -> list[np.ndarray]:
-    """True masks with displaced borders, and segments of sampled cuts."""
+def draw_masks(
+    rng: np.random.Generator, frame: Frame, instance: np.ndarray, grid: VoxelGrid, n: int
+) -> list[np.ndarray]:
+    """At most `n` masks (H, W): a third true ones with displaced borders, the others segments of sampled cuts."""
     import cv2
 
     true = []
@@ -171,8 +173,8 @@ def _masks(rng: np.random.Generator, frame: Frame, instance: np.ndarray) -> list
             mask = (cv2.dilate if change > 0 else cv2.erode)(mask, np.ones((3, 3), np.uint8))
         true.append(mask > 0)
     proposal = TreeCutProposal()
-    tree, w = proposal.tree_of(frame, _GRID)
-    segments = proposal.objects.segments(tree, frame, _GRID)
+    tree, w = proposal.tree_of(frame, grid)
+    segments = proposal.objects.segments(tree, frame, grid)
     sampler = MetropolisHastingsCuts(temperature=float(rng.choice([1.0, 4.0])), burn_in=300, thinning=100)
     cuts = sampler.sample(rng, tree, w, 3).cuts
     nodes = np.unique(np.concatenate([cut[segments.is_object[cut]] for cut in cuts]))
@@ -182,9 +184,9 @@ def _masks(rng: np.random.Generator, frame: Frame, instance: np.ndarray) -> list
     nodes = np.unique(np.where(up, parents, nodes))
     drawn = [tree.mask(int(node)) & segments.object_pixels for node in rng.permutation(nodes)]
     scene_cache.clear()
-    n_true = min(len(true), _N_MASKS // 3)
+    n_true = min(len(true), n // 3)
     chosen = [true[k] for k in rng.permutation(len(true))[:n_true]]
-    return chosen + drawn[: _N_MASKS - n_true]
+    return chosen + drawn[: n - n_true]
 
 
 def _sample(
@@ -213,7 +215,7 @@ def _sample(
     box = tuple(slice(int(o), int(o) + n) for o, n in zip(offset, seen.surface.shape, strict=True))
     shape, near = np.zeros(seen.surface.shape, bool), ndimage.binary_dilation(mask, np.ones((3, 3)), 2)
     for k in found:
-        shape |= _claimed(frame, instance == k, near, truth[box] == k, offset)
+        shape |= claimed_voxels(frame, instance == k, near, truth[box] == k, _GRID, offset)
     index = 2 if len(found) > 1 else int(counts[main] < _WHOLE * whole[main])
     bits, signed = (_padded(one) for one in encode_box(seen))
     return index, bits, signed, _padded(shape), main
@@ -251,8 +253,8 @@ def _view(rng: np.random.Generator, rule: Completer, earlier: _Earlier, found: S
     return ObjectView(offset, *encode_box(seen), "", RigidTransform.from_components(shift, turn))
 
 
-def _claimed(
-    frame: Frame, visible: np.ndarray, mask: np.ndarray, truth: np.ndarray, offset: np.ndarray
+def claimed_voxels(
+    frame: Frame, visible: np.ndarray, mask: np.ndarray, truth: np.ndarray, grid: VoxelGrid, offset: np.ndarray
 ) -> np.ndarray:
     """The voxels of an object, (a, b, c) bool in the box at `offset`, whose nearest visible point is in the mask."""
     pixels = np.flatnonzero(visible & frame.valid)
@@ -261,7 +263,7 @@ def _claimed(
         return truth
     points = frame.points.reshape(-1, 3)[pixels]
     voxels = np.argwhere(truth)
-    _, nearest = cKDTree(points).query(_GRID.centre_of(voxels + offset))
+    _, nearest = cKDTree(points).query(grid.centre_of(voxels + offset))
     claimed = np.zeros_like(truth)
     claimed[tuple(voxels[inside[nearest]].T)] = True
     return claimed

@@ -118,6 +118,15 @@ class Completer(SurfaceRule, ABC):
         """The probabilities of the voxels of several boxes."""
         return [self.fill(rng, one) for rng, one in zip(rngs, seen, strict=True)]
 
+    def opinions(
+        self, rngs: Sequence[np.random.Generator], seen: Sequence[ObservedBox]
+    ) -> list[tuple[np.ndarray, float]]:
+        """The probabilities of the voxels of several boxes, each with a factor 0 .. 1 of its weight in a pool.
+
+        The factor is 1, unless a completer knows that it cannot judge an object (`Posterior`).
+        """
+        return [(p, 1.0) for p in self.fill_many(rngs, seen)]
+
     def estimate(self, rngs: Sequence[np.random.Generator], seen: Sequence[ObservedBox]) -> list[np.ndarray]:
         """Call `fill_many`, and warn if the result ignores the input.
 

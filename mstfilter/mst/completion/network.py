@@ -4,15 +4,13 @@
 >>> NetworkCompleter(weights="trained/mine", architecture=MyArchitecture())  # an `Architecture` of the user
 >>> NetworkCompleter(weights="mine.onnx")                                    # needs the extra `onnx`
 
-The network works on a grid with voxels of 1 cm (the lattice). If those of the workspace have another size, the object
-is completed on the lattice, and the result is interpolated. Objects larger than 64 cm are completed by `Extrude`,
-because the network was trained on smaller ones.
+Objects larger than 64 cm are completed by `Extrude`, because the network was trained on smaller ones.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
@@ -20,11 +18,11 @@ from scipy.ndimage import binary_dilation
 
 from mstfilter.base.errors import missing_library
 from mstfilter.base.fields import Bounds, Share
-from mstfilter.mst.completion.completer import Completer, Completion, finish
-from mstfilter.mst.completion.crops import BATCH, EDGE, LARGER, LATTICE, Architecture, crop_box
+from mstfilter.mst.completion.crops import BATCH, EDGE, LARGER, Architecture
 from mstfilter.mst.completion.extrude import Extrude
-from mstfilter.mst.completion.observed import ObservedBox, observed_in
-from mstfilter.scene import Frame, ObjectView, Recording, UsesFiles, VoxelGrid
+from mstfilter.mst.completion.lattice import OnLattice
+from mstfilter.mst.completion.observed import ObservedBox
+from mstfilter.scene import Recording, UsesFiles
 
 if TYPE_CHECKING:
     from mstfilter.mst.completion.unet import TrainedNetwork
@@ -35,7 +33,7 @@ _LARGE_SURFACE = 100  # voxels of this layer
 
 
 @dataclass(frozen=True)
-class NetworkCompleter(Completer, UsesFiles):
+class NetworkCompleter(OnLattice, UsesFiles):
     """Completion by a trained network.
 
     Parameters
@@ -76,42 +74,6 @@ class NetworkCompleter(Completer, UsesFiles):
     @property
     def weights_key(self) -> str:
         return self.network.key
-
-    def box(self, voxels: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
-        return crop_box(voxels, grid)
-
-    def complete_each(
-        self,
-        rngs: Sequence[np.random.Generator],
-        frame: Frame,
-        masks: Sequence[np.ndarray],
-        grid: VoxelGrid,
-        views: Sequence[tuple[ObjectView, ...]] | None = None,
-    ) -> list[Completion]:
-        lattice = grid  # of the network, over the workspace; views have boxes of it
-        if abs(grid.voxel_size - LATTICE) >= 1e-6:
-            lattice = VoxelGrid.from_bounds(grid.origin, grid.upper, LATTICE)
-        found = super().complete_each(rngs, frame, masks, lattice, views)
-        if lattice is not grid:
-            found = [self._on_grid(one, frame, m, grid, lattice) for one, m in zip(found, masks, strict=True)]
-        return [one.shifted(self.log_odds).with_surface() for one in found]
-
-    def _on_grid(
-        self, one: Completion, frame: Frame, mask: np.ndarray, grid: VoxelGrid, lattice: VoxelGrid
-    ) -> Completion:
-        """A completion on the lattice, interpolated at the voxels of the grid."""
-        from scipy.ndimage import map_coordinates
-
-        corners = np.array([one.offset, one.offset + one.probability.shape]) * LATTICE / grid.voxel_size
-        low, high = np.floor(corners[0] + 1e-6).astype(np.int64), np.ceil(corners[1] - 1e-6).astype(np.int64)
-        high = np.maximum(np.minimum(high, grid.shape), low)
-        seen = observed_in(frame, np.asarray(mask, dtype=bool), grid, self, low, high)
-        p = np.zeros(seen.surface.shape, np.float32)
-        if p.size:
-            index = np.indices(p.shape).reshape(3, -1).T + low
-            at = (grid.centre_of(index) - np.asarray(lattice.origin)) / LATTICE - 0.5 - one.offset
-            p = map_coordinates(one.probability, at.T, order=1, mode="nearest").reshape(p.shape)
-        return replace(finish(low, seen, p, one.key), views=one.views)
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
         return self.fill_many([rng], [seen])[0]

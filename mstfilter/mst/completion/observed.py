@@ -89,10 +89,12 @@ class ObservedBox:
     #: (a, b, c) float32, voxels behind the measured surface along the optical axis; NaN if it is unknown.
     signed: np.ndarray
     height: np.ndarray  #: (c,) height of the voxel centres above the table in metres
+    latest: ObservedBox | None = None  #: what the latest frame alone shows, if earlier views are in the other fields
 
     def __post_init__(self) -> None:
         for f in fields(self):
-            object.__setattr__(self, f.name, read_only(getattr(self, f.name)))
+            if f.name != "latest":
+                object.__setattr__(self, f.name, read_only(getattr(self, f.name)))
 
 
 def observed_box(
@@ -236,9 +238,8 @@ def recall(seen: ObservedBox, offset: np.ndarray, grid: VoxelGrid, views: Sequen
     surface = (seen.surface | (Seen.SURFACE.among(bits) & ~near & ~seen.other_surface)) & ~free
     behind = (seen.behind | Seen.BEHIND.among(bits)) & ~free
     other, hidden = seen.other_surface & ~free, seen.hidden & ~free & ~behind
-    return ObservedBox(
-        seen.points, surface, other, free, behind, hidden, np.fmin(seen.signed, signed.reshape(shape)), seen.height
-    )
+    distance = np.fmin(seen.signed, signed.reshape(shape))
+    return ObservedBox(seen.points, surface, other, free, behind, hidden, distance, seen.height, seen)
 
 
 def _evidence(view: ObjectView, centres: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

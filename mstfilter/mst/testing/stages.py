@@ -18,7 +18,7 @@ import numpy as np
 from scipy import ndimage
 
 from mstfilter.base.errors import InputWarning
-from mstfilter.mst.completion import Completer, ObservedBox, observed_box
+from mstfilter.mst.completion import Completer, ObservedBox, Posterior, ShapeKind, observed_box
 from mstfilter.mst.completion.completer import fault_of
 from mstfilter.mst.crossover import Crossover, CrossoverUpdate, Structure
 from mstfilter.mst.partition import PairOdds, PartitionUpdate
@@ -57,6 +57,7 @@ STAGE_OWNERS: dict[type, Callable[[Any], Component]] = {
     CutValue: lambda stage: TreeCutProposal(value=stage),
     CutSampler: lambda stage: TreeCutProposal(sampler=stage),
     Completer: lambda stage: TreeCutProposal(completer=stage),
+    ShapeKind: lambda stage: TreeCutProposal(completer=Posterior(kinds=(stage,), n=32)),
     MaskTracker: lambda stage: TrackingTransition(tracker=stage),
     MotionRule: lambda stage: TrackingTransition(rule=stage),
     Registration: lambda stage: TrackingTransition(rule=MstRule(registration=stage)),
@@ -193,12 +194,14 @@ def _estimated(
 
 def _mirrored(box: ObservedBox) -> ObservedBox:
     """The box with its first axis reversed."""
-    return replace(box, **{f.name: getattr(box, f.name)[::-1] for f in fields(box) if f.name != "height"})
+    return replace(
+        box, **{f.name: getattr(box, f.name)[::-1] for f in fields(box) if f.name not in ("height", "latest")}
+    )
 
 
 def _cropped(box: ObservedBox, a: int, b: int, c: int) -> ObservedBox:
     """The first ``a x b x c`` voxels of a box."""
-    parts = {f.name: getattr(box, f.name)[:a, :b, :c] for f in fields(box) if f.name != "height"}
+    parts = {f.name: getattr(box, f.name)[:a, :b, :c] for f in fields(box) if f.name not in ("height", "latest")}
     return ObservedBox(**parts, height=box.height[:c])
 
 
@@ -269,6 +272,29 @@ class MotionRuleContract(StageContract):
             f"score, {scores[best]:.3g}, errs by {100 * errors[best]:.1f} cm: lower scores are better"
         )
         return errors
+
+
+class ShapeKindContract(StageContract):
+    """The contract of every `ShapeKind`."""
+
+    def test_distance_is_metric(self) -> None:
+        """Far outside, distances are positive and no larger than to the box's centre; some place is inside."""
+        kind, rng = self.make(), seeded(0)
+        half = rng.uniform(0.02, 0.1, (3, 40)).astype(np.float32)
+        if kind.round:
+            half[1] = half[0]
+        shape = rng.random((kind.n_shape, 40), dtype=np.float32)
+        ray = rng.standard_normal((3, 50, 40)).astype(np.float32)
+        ray *= 0.5 / np.linalg.norm(ray, axis=0)
+        with skips_errors():
+            away = kind.distance(half, shape, ray)
+            within = kind.distance(half, shape, rng.uniform(-1, 1, (3, 500, 40)).astype(np.float32) * half[:, None])
+        assert np.shape(away) == (50, 40), f"the distances have shape {np.shape(away)}, expected (50, 40)"
+        assert np.isfinite(away).all() and np.isfinite(within).all(), "some distances are not finite"
+        assert (away > 0).all() and (away <= 0.55).all(), (
+            f"50 cm from the centres of small boxes, the distances are {away.min():.2g} to {away.max():.2g} m"
+        )
+        assert (within < 0).any(axis=0).all(), "a shape contains none of 500 points of its box"
 
 
 class RegistrationContract(StageContract):
