@@ -31,7 +31,7 @@ from mstfilter.scene import Frame, posed_camera, scaled_area, scaled_length
 #: distance of their colours.
 DISAGREEMENT = {"misfit": 3.0, "height": 0.45, "texture": 0.9}
 #: Log odds of different objects: slope times (disagreement - even).
-SLOPE, EVEN = 3.0, 1.07
+SLOPE, EVEN = 3.2, 1.07
 _MOST_DISAGREEMENT = 3.0
 _STEP = 4.0  # sensor units of disparity: something this much nearer hides what is behind it
 _NEARER = 2.0  # sensor units: a pixel between two segments hides what is there if it is this much nearer than both
