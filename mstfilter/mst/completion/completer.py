@@ -104,6 +104,11 @@ class Completer(SurfaceRule, ABC):
     stochastic: ClassVar[bool] = False
 
     @property
+    def draws(self) -> bool:
+        """Whether a call uses its generator."""
+        return self.stochastic
+
+    @property
     def weights_key(self) -> str:
         """A hash of the trained weights; empty if there are none."""
         return ""
