@@ -62,7 +62,7 @@ class ShapeEvidence(NamedTuple):
     def of(cls, seen: ObservedBox) -> ShapeEvidence:
         """Raises IndexError if there is no visible surface."""
         rng = np.random.default_rng(0)
-        voxel = float(seen.height[1] - seen.height[0]) if len(seen.height) > 1 else 0.01
+        voxel = seen.voxel_size
         layer = np.argwhere(seen.surface)
         depth, inwards = _depths(seen.signed, layer)
         main = _main_part(seen)[tuple(layer.T)]
@@ -348,6 +348,6 @@ def _main_part(seen: ObservedBox) -> np.ndarray:
     size[0] = 0
     kept = (size >= _LEAST_PART * size.sum())[part]
     top = seen.height[np.flatnonzero(kept.any(axis=(0, 1)))[-1]]
-    voxel = seen.height[1] - seen.height[0] if len(seen.height) > 1 else 0.01
+    voxel = seen.voxel_size
     above = kept & (seen.height > voxel)
     return above if top > 4 * voxel and above.any() else kept

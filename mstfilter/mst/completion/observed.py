@@ -96,6 +96,11 @@ class ObservedBox:
             if f.name != "latest":
                 object.__setattr__(self, f.name, read_only(getattr(self, f.name)))
 
+    @property
+    def voxel_size(self) -> float:
+        """Edge of a voxel in metres; 1 cm for a box with one layer, which does not show it."""
+        return float(self.height[1] - self.height[0]) if len(self.height) > 1 else 0.01
+
 
 def observed_box(
     frame: Frame, mask: np.ndarray, grid: VoxelGrid, rule: SurfaceRule

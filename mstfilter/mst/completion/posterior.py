@@ -52,6 +52,7 @@ from mstfilter.mst.completion.kinds import (
 )
 from mstfilter.mst.completion.lattice import OnLattice
 from mstfilter.mst.completion.observed import ObservedBox
+from mstfilter.smc.resampling import inverse_cdf
 
 SHAPE_KINDS = (
     BoxKind(share=3.0),
@@ -167,9 +168,9 @@ class Posterior(OnLattice):
             power += step
             log_w = log_w + step * found
             top = log_w.max()
-            total = np.exp(log_w - top).sum()
-            log_evidence += top + np.log(total)
-            chosen = _systematic(rng, np.exp(log_w - top) / total, self.n)
+            w = np.exp(log_w - top)
+            log_evidence += top + np.log(w.sum())
+            chosen = inverse_cdf(w, rng.random(1), self.n)
             group, u, found = group[chosen], u[:, chosen], found[chosen]
             log_w = np.full(self.n, -np.log(self.n))
             for _ in range(_MOVES):
@@ -296,7 +297,3 @@ def _next_step(log_w: np.ndarray, found: np.ndarray, most: float, share: float) 
         middle = (low + high) / 2
         low, high = (middle, high) if ess(middle) >= target else (low, middle)
     return low
-
-
-def _systematic(rng: np.random.Generator, w: np.ndarray, n: int) -> np.ndarray:
-    return np.minimum(np.searchsorted(np.cumsum(w), (np.arange(n) + rng.random()) / n), len(w) - 1)

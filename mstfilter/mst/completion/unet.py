@@ -141,8 +141,7 @@ class TrainedNetwork:
         for k, one in enumerate(seen):
             a, b, c = one.surface.shape
             bits[k, :a, :b, :c], signed[k, :a, :b, :c] = encode_box(one)
-            step = one.height[1] - one.height[0] if c > 1 else 0.01
-            height = one.height[0] + step * np.arange(edge)
+            height = one.height[0] + one.voxel_size * np.arange(edge)
         with torch.inference_mode(), one_thread():
             x = channels(torch.from_numpy(bits), torch.from_numpy(signed), torch.from_numpy(height).float())
             p = torch.sigmoid(self.scale * self.forward(x) + self.shift)

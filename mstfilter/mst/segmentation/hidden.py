@@ -16,6 +16,7 @@ simulated and real images (``experiments/segmentation_fit/hidden.py``).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -65,9 +66,8 @@ def hidden_pairs(segments: np.ndarray, sums: np.ndarray, frame: Frame) -> tuple[
     points = posed_camera(frame).unproject(frame.depth)
     pairs = [
         (a, b)
-        for a in sorted(own)
-        for b in sorted(own)
-        if a < b and (a, b) not in touching and _divided(a, b, own[a], own[b], segments, disparity, shadow, points)
+        for a, b in combinations(sorted(own), 2)
+        if (a, b) not in touching and _divided(a, b, own[a], own[b], segments, disparity, shadow, points)
     ]
     first, second = np.array(pairs, dtype=int).reshape(-1, 2).T
     none = np.broadcast_to(NO_BORDER, (len(pairs), len(NO_BORDER)))

@@ -192,16 +192,18 @@ def _estimated(
         return bound.estimate([child(rng, "box", first + k) for k in range(len(seen))], seen)
 
 
+#: Fields of `ObservedBox` with a value for each voxel.
+_IMAGES = [f.name for f in fields(ObservedBox) if f.name not in ("height", "latest")]
+
+
 def _mirrored(box: ObservedBox) -> ObservedBox:
     """The box with its first axis reversed."""
-    return replace(
-        box, **{f.name: getattr(box, f.name)[::-1] for f in fields(box) if f.name not in ("height", "latest")}
-    )
+    return replace(box, **{name: getattr(box, name)[::-1] for name in _IMAGES})
 
 
 def _cropped(box: ObservedBox, a: int, b: int, c: int) -> ObservedBox:
     """The first ``a x b x c`` voxels of a box."""
-    parts = {f.name: getattr(box, f.name)[:a, :b, :c] for f in fields(box) if f.name not in ("height", "latest")}
+    parts = {name: getattr(box, name)[:a, :b, :c] for name in _IMAGES}
     return ObservedBox(**parts, height=box.height[:c])
 
 
