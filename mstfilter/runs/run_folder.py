@@ -421,7 +421,7 @@ class RunFolder:
         """The belief after pause `t`: the hypotheses, and the weighted segmentations of its image."""
         population = self.state(t).population
         assert population is not None
-        return Belief(population, self.segmentations(t))
+        return Belief(population, self.segmentations(t), t)
 
     def estimates(self) -> list[PauseEstimate]:
         """The weighted hypotheses of all pauses, for `mstfilter.scoring.score_pauses`."""

@@ -31,6 +31,7 @@ from mstfilter.scene.frame import (
     check_depth as check_depth,
     depth_sigma as depth_sigma,
     grey_blocks as grey_blocks,
+    main_colour as main_colour,
 )
 from mstfilter.scene.geometry import (
     frame_geometry as frame_geometry,

@@ -45,6 +45,7 @@ def encode_hypotheses(hypotheses: Sequence[Hypothesis]) -> dict[str, np.ndarray]
         "label": np.array([r.label for _, r in rows], np.int64),
         "id": np.array([r.id for _, r in rows], np.int64),
         "birth": np.array([r.birth for _, r in rows], np.int64),
+        "last_seen": np.array([r.last_seen for _, r in rows], np.int64),
         "motion": _matrices(r.motion for _, r in rows),
         "pose": _matrices(r.pose for _, r in rows),
         "completion_key": np.array([r.completion_key or "" for _, r in rows], np.str_),
@@ -108,6 +109,7 @@ def decode_hypotheses(arrays: Mapping[str, np.ndarray]) -> tuple[Hypothesis, ...
     begin, views = 0, _decode_views(arrays)
     probabilities = _Reader(arrays["source_probability"]) if "source_probability" in arrays else None
     poses = arrays.get("pose", arrays["motion"])  # version 0.1 has no poses
+    last_seen = arrays.get("last_seen", arrays["birth"])  # not in old files
     for row, owner in enumerate(arrays["owner"].tolist()):
         crop = None
         if arrays["has_source"][row]:
@@ -129,6 +131,7 @@ def decode_hypotheses(arrays: Mapping[str, np.ndarray]) -> tuple[Hypothesis, ...
                 str(arrays["completion_key"][row]) or None,
                 tuple(views.get(row, ())),
                 RigidTransform(poses[row], normalize=False),
+                int(last_seen[row]),
             )
         )
     found = []

@@ -268,3 +268,21 @@ def areas_of_colours(frame: Frame, mask: np.ndarray) -> np.ndarray:
         np.add.at(areas, tuple((low + corner).T), np.where(corner, at - low, 1 - (at - low)).prod(axis=1))
     pixel = float(np.median(depth)) ** 2 / (frame.camera.K[0, 0] * frame.camera.K[1, 1])
     return (pixel * areas.ravel()).astype(np.float32)
+
+
+def main_colour(areas: np.ndarray) -> tuple[int, int, int]:
+    """The colour (r, g, b) around which most of the visible area lies, from `areas_of_colours` (144,).
+
+    It is the mean colour of the bin with the largest area and of its neighbours.
+    """
+    import cv2
+
+    table = np.asarray(areas, dtype=np.float64).reshape(_BINS)
+    best = np.array(np.unravel_index(table.argmax(), _BINS))
+    low = np.maximum(best - 1, 0)
+    near = table[tuple(slice(a, b + 2) for a, b in zip(low, best, strict=True))]
+    at = np.indices(near.shape).reshape(3, -1).T + low + 0.5
+    lab = _LOWEST + np.asarray(_WIDTH) * (near.ravel() @ at / max(near.sum(), 1e-12))
+    rgb = cv2.cvtColor(lab[None, None].astype(np.float32), cv2.COLOR_Lab2RGB)[0, 0]
+    r, g, b = np.clip(np.rint(255 * rgb), 0, 255).astype(int).tolist()
+    return r, g, b

@@ -243,6 +243,7 @@ class ObjectRecord:
     views: tuple[ObjectView, ...] = ()  #: observations of the object in frames, oldest first
     #: Rigid motion in world metres since the object was first proposed, also across changes of its voxels.
     pose: RigidTransform = field(default_factory=lambda: _NO_MOTION)
+    last_seen: int = 0  #: index of the last pause whose image showed the object
 
     def __repr__(self) -> str:
         moved = ", moved" * (self.pose is not _NO_MOTION)
@@ -262,7 +263,7 @@ class ObjectRecord:
         Each pair of `birth` and `label` gives a different `id`, which is not one of the ids `taken`.
         """
         identity = free_id(birth * _IDS + label, taken)
-        return cls(label, identity, birth, completion_key=completion_key, views=views)
+        return cls(label, identity, birth, completion_key=completion_key, views=views, last_seen=birth)
 
     def moved(self, T: RigidTransform, source: Crop) -> ObjectRecord:
         """The `ObjectRecord` after a rigid motion T. `source` has the voxels before the first motion."""
@@ -380,7 +381,7 @@ class Hypothesis:
         """The hypothesis with all objects first proposed at the pause `birth`, with the ids of this pause."""
         if all(record.birth == birth for record in self.objects):
             return self
-        records = (replace(r, birth=birth, id=birth * _IDS + r.label) for r in self.objects)
+        records = (replace(r, birth=birth, last_seen=birth, id=birth * _IDS + r.label) for r in self.objects)
         return replace(self, objects=tuple(records))
 
     def with_labels(self, labels: np.ndarray) -> Hypothesis:

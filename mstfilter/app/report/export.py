@@ -19,6 +19,7 @@ from mstfilter.app.report.pictures import Colour, colour
 from mstfilter.base.errors import InputError
 from mstfilter.base.files import atomic_path
 from mstfilter.base.lazy import import_open3d
+from mstfilter.mst.belief import BelievedObject
 from mstfilter.scene import Hypothesis
 
 # Corners of the face of a unit voxel towards +axis, counter-clockwise seen from outside; reversed towards -axis.
@@ -54,6 +55,20 @@ def object_mesh(hypothesis: Hypothesis, label: int) -> tuple[np.ndarray, np.ndar
     hypothesis.record(label)
     corners, triangles = voxel_faces(hypothesis.mask(label))
     return hypothesis.grid.origin + corners * hypothesis.grid.voxel_size, triangles
+
+
+def smooth_mesh(one: BelievedObject) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (v, 3) in world metres and triangles (f, 3) of the surface on which an object has probability .5.
+
+    The surface is closed (marching cubes). Seen from outside, the corners of a triangle are in counter-clockwise
+    order. If no voxel has probability .5, because hypotheses disagree on the place, the level is half of the largest.
+    """
+    from skimage.measure import marching_cubes
+
+    p = np.pad(np.asarray(one.shape.probability, dtype=np.float32), 1)
+    level = min(0.5, float(p.max()) / 2)
+    corners, triangles, _, _ = marching_cubes(p, level, gradient_direction="ascent")
+    return one.origin + (one.shape.offset + corners - 0.5) * one.voxel_size, triangles
 
 
 def export_mesh(hypothesis: Hypothesis, path: str | Path, colours: Mapping[int, Colour] | None = None) -> Path:

@@ -8,6 +8,7 @@
 >>> max(cameras, key=belief.view_information)                     # the most informative camera
 >>> belief.estimate()                                             # the hypothesis of least expected loss
 >>> belief.push_map(tolerance=50)                                 # information of a push at each voxel
+>>> belief.objects()                                              # a table: where, how certain, hidden, one with what
 
 The probability of a statement is the total weight of the hypotheses in which it holds: hypothesis i has labels L_i
 and the normalised weight w_i. Each hypothesis numbers its objects as it likes, so no answer depends on the numbers.
@@ -47,6 +48,7 @@ from mstfilter.mst.belief.information import (
     outcome_information,
     partition_distance,
 )
+from mstfilter.mst.belief.objects import ObjectTable, object_table
 from mstfilter.scene import (
     Camera,
     CommonRefinement,
@@ -97,11 +99,14 @@ class Belief:
         merged, and those of weight 0 are ignored.
     seen : WeightedSegmentations, optional
         All segmentations of the last image that the filter has weighed. If asked with the camera of this image,
-        `same_object_at_pixels`, `open_borders` and `disagreement` answer from them.
+        `same_object_at_pixels`, `open_borders`, `disagreement` and `objects` answer from them.
+    pause : int, optional
+        Index of the last pause. By default, the last one at which an object of a hypothesis was seen.
     """
 
     population: Population
     seen: WeightedSegmentations | None = None
+    pause: int | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.population, Population):
@@ -118,12 +123,12 @@ class Belief:
         """The belief after a step, with all segmentations that the update has weighed, if it notes them."""
         if state.population is None:
             raise InputError("the state has no particles before the first step", "state, info = filter.step(...)")
-        return cls(state.population, info.notes.get("update", {}).get("segmentations"))
+        return cls(state.population, info.notes.get("update", {}).get("segmentations"), info.t)
 
     @property
     def kept(self) -> Belief:
         """The belief of the kept hypotheses alone."""
-        return Belief(self.population)
+        return Belief(self.population, pause=self.pause)
 
     def __repr__(self) -> str:
         weights = ", ".join(f"{w:.3g}" for w in np.sort(self._mass)[::-1][:8]) + ", ..." * (len(self._mass) > 8)
@@ -152,7 +157,7 @@ class Belief:
         return self.population.particles[0].grid
 
     @cached_property
-    def _merged(self) -> tuple[tuple[Hypothesis, ...], np.ndarray]:
+    def distinct(self) -> tuple[tuple[Hypothesis, ...], np.ndarray]:
         """Distinct hypotheses of positive weight, and their weights."""
         which = first_seen(h.key + (h.occupancy.key if h.occupancy else b"") for h in self.hypotheses)
         mass = np.bincount(which, self.weights)
@@ -162,11 +167,12 @@ class Belief:
 
     @property
     def _mass(self) -> np.ndarray:
-        return self._merged[1]
+        return self.distinct[1]
 
     @cached_property
-    def _refined(self) -> CommonRefinement:
-        return common_refinement([h.labels for h in self._merged[0]])
+    def refined_voxels(self) -> CommonRefinement:
+        """The cells of voxels that no distinct hypothesis separates."""
+        return common_refinement([h.labels for h in self.distinct[0]])
 
     # Voxels and regions ---------------------------------------------------------------------------------------
 
@@ -192,7 +198,7 @@ class Belief:
 
         o_i(v) is the probability, in hypothesis i, of the most probable object at voxel v (`Hypothesis.shares`).
         """
-        shares = [h.shares.probability for h in self._merged[0]]
+        shares = [h.shares.probability for h in self.distinct[0]]
         return sum((w * p.astype(np.float64) for w, p in zip(self._mass, shares, strict=True)), np.zeros(()))
 
     def same_object(self, a: Any, b: Any) -> np.ndarray:
@@ -212,7 +218,7 @@ class Belief:
 
     @cached_property
     def _flat_shares(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        shares = [h.shares for h in self._merged[0]]
+        shares = [h.shares for h in self.distinct[0]]
         return [(one.owner.ravel(), one.probability.ravel().astype(np.float64)) for one in shares]
 
     def same_object_at_pixels(self, camera: Camera, a: Any, b: Any) -> np.ndarray:
@@ -227,7 +233,7 @@ class Belief:
 
     def object_count(self) -> np.ndarray:
         """Probability (K + 1,) of k = 0 .. K objects: ``sum_i w_i [hypothesis i has k objects]``."""
-        return np.bincount(np.diff(self._refined.first), self._mass)
+        return np.bincount(np.diff(self.refined_voxels.first), self._mass)
 
     # Boundaries and entropy -----------------------------------------------------------------------------------
 
@@ -247,10 +253,10 @@ class Belief:
 
     def _entropy_of_faces(self, axis: int) -> np.ndarray:
         """H(S | B) of the faces between neighbouring voxels along `axis`, which is the first axis of the result."""
-        cells = np.moveaxis(self._refined.cells, axis, 0)
+        cells = np.moveaxis(self.refined_voxels.cells, axis, 0)
         lower, upper = cells[:-1], cells[1:]
         differ = (lower != upper) & (lower > 0) & (upper > 0)  # inside a cell, both are always one object
-        a, b = self._refined.objects[:, lower[differ]], self._refined.objects[:, upper[differ]]
+        a, b = self.refined_voxels.objects[:, lower[differ]], self.refined_voxels.objects[:, upper[differ]]
         both, same = self._mass @ ((a > 0) & (b > 0)), self._mass @ ((a > 0) & (a == b))
         entropy = np.zeros(differ.shape)
         entropy[differ] = both * binary_entropy(np.divide(same, both, out=np.zeros_like(same), where=both > 0))
@@ -310,8 +316,8 @@ class Belief:
         information of being told the true segmentation, so without tolerance no outcome that the labels determine
         tells more. The distance for the tolerance is `information.partition_distance`.
         """
-        rows = canonical_rows(self._refined.objects)
-        return outcome_information(self._mass, rows, partition_distance, self._refined.sizes, tolerance)
+        rows = canonical_rows(self.refined_voxels.objects)
+        return outcome_information(self._mass, rows, partition_distance, self.refined_voxels.sizes, tolerance)
 
     # Expected information of actions --------------------------------------------------------------------------
 
@@ -322,7 +328,7 @@ class Belief:
         """
         step = _DEPTH_STEP * self.grid.voxel_size
         check_component("camera", camera, Camera)
-        depths = (render_hypothesis(h, camera).depth.ravel() for h in self._merged[0])
+        depths = (render_hypothesis(h, camera).depth.ravel() for h in self.distinct[0])
         pixels = np.stack([np.nan_to_num(np.round(d / step), nan=-1).astype(np.int32) for d in depths])
         pixels = pixels[:, (pixels != pixels[0]).any(axis=0)]
         return outcome_information(self._mass, pixels, hamming, np.ones(pixels.shape[1]), tolerance)
@@ -333,14 +339,14 @@ class Belief:
         The outcome ``{v | L_i(v) = L_i(u) > 0 for a u in region}`` has all voxels of the objects with a voxel in the
         region. Other objects that these would push along are ignored.
         """
-        cells = np.unique(self._refined.cells.ravel()[_flat_region(self.grid, region)])
-        moved = self._refined.objects_in(cells)[self._refined.objects]
-        return outcome_information(self._mass, moved, hamming, self._refined.sizes, tolerance)
+        cells = np.unique(self.refined_voxels.cells.ravel()[_flat_region(self.grid, region)])
+        moved = self.refined_voxels.objects_in(cells)[self.refined_voxels.objects]
+        return outcome_information(self._mass, moved, hamming, self.refined_voxels.sizes, tolerance)
 
     def push_map(self, tolerance: float = 0.0) -> np.ndarray:
         """`push_information` (X, Y, Z) of each voxel."""
         check_number("tolerance", tolerance, at_least=0, unit="number of voxels")
-        refined, mass = self._refined, self._mass
+        refined, mass = self.refined_voxels, self._mass
         overlap = refined.overlaps()
         volume = overlap.diagonal()
         distance = volume[:, None] + volume[None, :] - 2 * overlap
@@ -387,19 +393,28 @@ class Belief:
         The loss is 1 - quality (weighted coverage in the form ``objects``). If the true scene is distributed as the
         belief says, no hypothesis is a better single answer.
         """
-        hypotheses, mass = self._merged
+        hypotheses, mass = self.distinct
         return hypotheses[least_loss([h.labels for h in hypotheses], mass)]
+
+    def objects(self, camera: Camera | None = None, previous: ObjectTable | None = None) -> ObjectTable:
+        """One table of the objects: existence, place, shape, visible or hidden, and with what they may be one.
+
+        See `mstfilter.mst.belief.objects`. `camera` is that of the last image, whose pixels are asked about visible
+        objects; by default, that of the weighted segmentations, and if there are none, only voxels are asked. With
+        the table of the `previous` pause, objects keep their numbers.
+        """
+        return object_table(self, camera, previous)
 
     def refined_image(self, camera: Camera) -> tuple[CommonRefinement, np.ndarray]:
         """The cells of the segmentations that a camera sees, and the weights (n,) of the segmentations."""
         if self.seen is not None and self.seen.are_of(camera):
             return self.seen.refinement, self.seen.weights
-        images, keys = self._images(camera), [h.key for h in self._merged[0]]
+        images, keys = self._images(camera), [h.key for h in self.distinct[0]]
         return memo("refined image", (camera.key, *keys), lambda: common_refinement(images)), self._mass
 
     def _images(self, camera: Camera) -> list[np.ndarray]:
         check_component("camera", camera, Camera)
-        return [project(h, camera) for h in self._merged[0]]
+        return [project(h, camera) for h in self.distinct[0]]
 
 
 def _sides(refined: CommonRefinement, mass: np.ndarray, a: np.ndarray, b: np.ndarray, at: list[int]) -> np.ndarray:

@@ -237,17 +237,24 @@ class _Child:
         return replace(child, occupancy=self._occupancy(labels, parents))
 
     def _records(self, parents: tuple[Hypothesis, Hypothesis]) -> tuple[ObjectRecord, ...]:
-        """The `ObjectRecord` of each object's head (`_heads`). If voxels have changed, the motion history ends."""
+        """The `ObjectRecord` of each object's head (`_heads`). If voxels have changed, the motion history ends.
+
+        It was last seen when one of its parts was.
+        """
         heads = self._heads()
         record_of = [{record.label: record for record in parent.objects} for parent in parents]
         kinds = zip(self.graph.side[heads].tolist(), self.graph.label[heads].tolist(), strict=True)
+        seen: dict[int, int] = {}
+        vertices = zip(self.group.tolist(), self.graph.side.tolist(), self.graph.label.tolist(), strict=True)
+        for group, side, label in vertices:
+            seen[group] = max(seen.get(group, 0), record_of[side][label].last_seen)
         taken = {record.id for record in parents[PREDICTED].objects}
         records = []
         for k, (side, label) in enumerate(kinds, start=1):
             record = record_of[side][label]
             identity = record.id if side == PREDICTED else free_id(record.id, taken)
             taken.add(identity)
-            records.append(replace(record, label=k, id=identity))
+            records.append(replace(record, label=k, id=identity, last_seen=seen[int(self.groups[k - 1])]))
         unchanged = self._unchanged(heads).tolist()
         return tuple(r if same else r.changed() for r, same in zip(records, unchanged, strict=True))
 

@@ -344,7 +344,7 @@ class PartitionUpdate(Update):
         return [completed[k] for k in range(len(objects))]
 
     def _record(
-        self, label: int, one: SceneObject, completion: Completion, birth: int, known: Collection[int]
+        self, label: int, one: SceneObject, completion: Completion, pause: int, known: Collection[int]
     ) -> ObjectRecord:
         """The `ObjectRecord` of the first predicted object that an object continues, or a new `ObjectRecord`.
 
@@ -352,8 +352,10 @@ class PartitionUpdate(Update):
         """
         key, views = completion.key, self._latest(completion.views)
         if not one.tracks:
-            return ObjectRecord.born(label, birth, key, views, known)
-        return replace(one.tracks[0].changed(), label=label, completion_key=key, views=views)
+            return ObjectRecord.born(label, pause, key, views, known)
+        record = one.tracks[0].changed()
+        last_seen = pause if one.readings.any() else record.last_seen
+        return replace(record, label=label, last_seen=last_seen, completion_key=key, views=views)
 
     def _latest(self, *histories: tuple[ObjectView, ...]) -> tuple[ObjectView, ...]:
         """The latest views of several objects. For each object, the oldest view is first."""
