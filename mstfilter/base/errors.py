@@ -208,12 +208,12 @@ def install_hint(library: str) -> str:
 #: What pip installs for a library that has another name there, or that belongs to an extra of this package.
 _PACKAGES = {
     "cv2": "opencv-python-headless",
+    "skimage": "scikit-image",
     "rosbags": "'mstfilter[bags]'",
     "onnxruntime": "'mstfilter[onnx]'",
     "xarray": "'mstfilter[xarray]'",
     "distributed": "'mstfilter[cluster]'",
     "coacd": "'mstfilter[objects]'",
-    "trimesh": "'mstfilter[objects]'",
 }
 
 

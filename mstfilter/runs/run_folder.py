@@ -41,7 +41,7 @@ from mstfilter.base.files import (
 from mstfilter.base.reading import MAX_FILE, read_arrays, read_model
 from mstfilter.formats import read_labels, read_rgb, write_image
 from mstfilter.formats.folder import CameraFile
-from mstfilter.mst.belief import Belief
+from mstfilter.mst.belief import Belief, ObjectTable
 from mstfilter.scene import (
     Camera,
     Clip,
@@ -422,6 +422,14 @@ class RunFolder:
         population = self.state(t).population
         assert population is not None
         return Belief(population, self.segmentations(t), t)
+
+    def objects(self, t: int) -> ObjectTable:
+        """The table of objects at pause `t`, with the numbers that objects have had since pause 0."""
+        table = None
+        for k in range(t + 1):
+            table = self.belief(k).objects(previous=table)
+        assert table is not None
+        return table
 
     def estimates(self) -> list[PauseEstimate]:
         """The weighted hypotheses of all pauses, for `mstfilter.scoring.score_pauses`."""

@@ -1,26 +1,25 @@
-"""Meshes of hypotheses for other programs, written with open3d.
+"""Meshes for other programs: smooth surfaces of believed objects, or the voxels of a hypothesis.
 
+>>> export_mesh(belief.objects(), "scene.glb")                                      # for viewers and planners
 >>> export_mesh(hypothesis, "scene.ply")
 >>> export_mesh(hypothesis, "scene.obj", assign_identities(run).colours(t, k))      # the colours of the report
-
-Objects share no vertices. The z axis points up as in the recording.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from mstfilter.app.report.pictures import Colour, colour
-from mstfilter.base.errors import InputError
-from mstfilter.base.files import atomic_path
-from mstfilter.base.lazy import import_open3d
-from mstfilter.mst.belief import BelievedObject
+from mstfilter.base.errors import InputError, check_choice
+from mstfilter.base.files import atomic_path, writing
+from mstfilter.mst.belief import BelievedObject, ObjectTable
 from mstfilter.scene import Hypothesis
+
+_KINDS = ("glb", "ply", "obj", "stl")
+_Y_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # from axes with z up
 
 # Corners of the face of a unit voxel towards +axis, counter-clockwise seen from outside; reversed towards -axis.
 _CORNERS = {
@@ -71,24 +70,46 @@ def smooth_mesh(one: BelievedObject) -> tuple[np.ndarray, np.ndarray]:
     return one.origin + (one.shape.offset + corners - 0.5) * one.voxel_size, triangles
 
 
-def export_mesh(hypothesis: Hypothesis, path: str | Path, colours: Mapping[int, Colour] | None = None) -> Path:
-    """Write the mesh of a hypothesis to a ply or obj file, in world metres. The hypothesis must have an object.
+def export_mesh(
+    scene: Hypothesis | ObjectTable, path: str | Path, colours: Mapping[int, Colour] | None = None
+) -> Path:
+    """Write the meshes of all objects to a file: .glb, .ply, .obj or .stl.
 
-    The triangles are the outer faces of the objects. The mesh of an object encloses exactly the volume of its voxels.
-    `colours` is ``{label: (r, g, b)}``. By default, the colours of the palette are used in order of labels. Raises
-    MissingLibraryError if open3d cannot be imported.
+    Parameters
+    ----------
+    scene : Hypothesis or ObjectTable
+        Of a hypothesis, the outer faces of the voxels, which enclose exactly their volume; of a table of objects
+        (`Belief.objects`), smooth surfaces. It must have an object.
+    path : path
+        Coordinates are world metres with z up, but in .glb, whose axis up is y by definition. Objects are separate
+        nodes ("object 3") in .glb, and share no vertices in the others. STL has no colours.
+    colours : mapping, optional
+        ``{label: (r, g, b)}``, of a table ``{number: (r, g, b)}``. Default: the palette in the order of the objects.
+
+    Raises InputError for another ending, a scene without objects, and a file that cannot be written.
     """
-    path, o3d = Path(path), import_open3d()
-    mesh = o3d.geometry.TriangleMesh()
-    for k, record in enumerate(hypothesis.objects):
-        corners, triangles = object_mesh(hypothesis, record.label)
-        vertices = o3d.utility.Vector3dVector(corners)
-        part = o3d.geometry.TriangleMesh(vertices, o3d.utility.Vector3iVector(triangles))
-        part.paint_uniform_color(np.array(colour(k) if colours is None else colours[record.label]) / 255)
-        mesh += part
-    with atomic_path(path) as partial, TemporaryDirectory(dir=partial.parent) as folder:
-        work = str(Path(folder) / path.name)  # open3d writes the name into OBJ files
-        if not o3d.io.write_triangle_mesh(work, mesh):
-            raise InputError(f"open3d cannot write the mesh {path}", "choose another folder")
-        os.replace(work, partial)
+    import trimesh
+
+    path = Path(path)
+    kind = path.suffix[1:].lower()
+    check_choice("ending of a mesh file", kind, _KINDS)
+    if isinstance(scene, Hypothesis):
+        meshes = {record.label: object_mesh(scene, record.label) for record in scene.objects}
+    else:
+        meshes = {one.number: smooth_mesh(one) for one in scene}
+    if not meshes:
+        raise InputError("the scene has no objects, so there is no mesh", "check hypothesis.n_objects or len(table)")
+    parts = {}
+    for k, (name, (corners, triangles)) in enumerate(meshes.items()):
+        part = trimesh.Trimesh(corners, triangles, process=False)
+        part.visual = trimesh.visual.ColorVisuals(part, vertex_colors=colour(k) if colours is None else colours[name])
+        parts[f"object {name}"] = part
+    if kind == "glb":
+        whole = trimesh.Scene(parts)
+        whole.apply_transform(_Y_UP)
+    else:
+        whole = trimesh.util.concatenate(list(parts.values()))
+    data = whole.export(file_type=kind)
+    with writing(f"mesh {path}", "choose another file"), atomic_path(path) as partial:
+        partial.write_bytes(data.encode() if isinstance(data, str) else data)
     return path

@@ -29,7 +29,7 @@ now, and it has its own ids.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import count, product
@@ -59,8 +59,10 @@ class BelievedObject:
     """One object, as all hypotheses together describe it. Lengths are in metres, in the frame of the grid."""
 
     number: int  #: names the object in this table and in later ones
-    label: int  #: in `Belief.estimate()`; 0 if the estimate has no such object
-    record: ObjectRecord  #: of the estimate, or of the most probable hypothesis that has the object
+    hypothesis: int  #: index in `Belief.hypotheses` of the one that it is taken from
+    label: int  #: in this hypothesis
+    in_estimate: bool  #: whether this hypothesis is `Belief.estimate()`
+    record: ObjectRecord  #: in this hypothesis
     existence: float  #: probability that there is an object
     visible: bool  #: whether the last image shows it
     last_seen: int  #: index of the last pause at which it was seen
@@ -113,7 +115,7 @@ class BelievedObject:
         return {
             "object": self.number,
             "id": self.record.id,
-            "label": self.label,
+            "in_estimate": self.in_estimate,
             "existence": round(self.existence, 4),
             "visible": self.visible,
             "last_seen": self.last_seen,
@@ -167,6 +169,15 @@ class ObjectTable:
         """`BelievedObject.row` of every object."""
         return [one.row() for one in self]
 
+    def renumbered(self, numbers: Sequence[int]) -> ObjectTable:
+        """The table with other numbers, one for each object."""
+        new = dict(zip((one.number for one in self), numbers, strict=True))
+        objects = (
+            replace(one, number=new[one.number], one_with={new[k]: p for k, p in one.one_with.items()})
+            for one in self
+        )
+        return replace(self, objects=tuple(objects), last_number=max([self.last_number, *numbers]))
+
 
 def object_table(belief: Belief, camera: Camera | None = None, previous: ObjectTable | None = None) -> ObjectTable:
     """The objects of a belief; see `Belief.objects`."""
@@ -210,11 +221,7 @@ def _numbered(table: ObjectTable, previous: ObjectTable | None) -> ObjectTable:
     known = {int(r): earlier[k].number for r, k in pairs if score[r, k] >= _LEAST_SCORE}
     fresh = count(last + 1)
     numbers = [known.get(r) or next(fresh) for r in range(len(table))]
-    objects = (
-        replace(one, number=n, one_with={numbers[other]: p for other, p in one.one_with.items()})
-        for n, one in zip(numbers, table, strict=True)
-    )
-    return replace(table, objects=tuple(objects), last_number=next(fresh) - 1)
+    return replace(table.renumbered(numbers), last_number=next(fresh) - 1)
 
 
 def _jaccard(a: Crop, b: Crop) -> float:
@@ -354,7 +361,9 @@ class _Matching:
         known = [one.colours for one in record.views if one.colours.any()]
         return BelievedObject(
             number=r,
-            label=label if r < self.in_estimate else 0,
+            hypothesis=self.belief.hypotheses.index(self.hypotheses[i]),
+            label=label,
+            in_estimate=r < self.in_estimate,
             record=record,
             existence=votes.probability(mass),
             visible=self.is_visible(i, label),

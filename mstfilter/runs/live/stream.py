@@ -30,7 +30,7 @@ from mstfilter.base.errors import InputError, check_component, check_integer, wa
 from mstfilter.base.processes import parallel
 from mstfilter.base.registry import nested_components
 from mstfilter.formats import Settled
-from mstfilter.mst.belief import Belief
+from mstfilter.mst.belief import Belief, ObjectTable
 from mstfilter.mst.tracking import DenseFlow
 from mstfilter.runs.presets import preset
 from mstfilter.scene import (
@@ -160,6 +160,7 @@ class Stream:
         self._abandoned = False  # whether an error or Ctrl-C ends the stream: queued frames are not filtered
         self._step: Future[None] | None = None
         self._error: BaseException | None = None
+        self._table: tuple[int | None, ObjectTable] | None = None  # the last one that was asked for, and its pause
         self.last: Pause | None = None  #: the result at the last pause
         self.counts: Counter[str] = Counter()  #: see `Pause.counts`
         self._queue: queue.Queue[_Item | None] = queue.Queue(max_frames)
@@ -302,6 +303,15 @@ class Stream:
         if self.last is None or self.last.state.population is None:
             raise InputError("the stream has had no pause yet", "push frames until nothing moves, and call wait()")
         return Belief.of_step(self.last.state, self.last.info)
+
+    @property
+    def objects(self) -> ObjectTable:
+        """The table of objects at the last pause (`Belief.objects`). Objects keep their numbers from table to table."""
+        belief = self.belief
+        if self._table is None or self._table[0] != belief.pause:
+            previous = None if self._table is None else self._table[1]
+            self._table = (belief.pause, belief.objects(previous=previous))
+        return self._table[1]
 
     def wait(self) -> None:
         """Wait until all pushed frames are processed. Raises InputError in `on_pause`, which it would wait for."""

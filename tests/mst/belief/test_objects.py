@@ -88,7 +88,12 @@ def test_an_object_that_only_others_have():
     """A row of its own, with its weight, unless the estimate has something there."""
     belief = belief_of((0.7, scene(LEFT, FAR)), (0.3, scene(LEFT, FAR, HIDDEN, hidden=(3,))))
     hidden = at(belief.objects(), HIDDEN)
-    assert hidden.label == 0 and hidden.existence == pytest.approx(0.3) and not hidden.visible
+    assert (
+        not hidden.in_estimate
+        and hidden.hypothesis == 1
+        and hidden.existence == pytest.approx(0.3)
+        and not hidden.visible
+    )
     twice = belief_of(
         (0.6, scene(LEFT)), (0.2, scene(LEFT, HIDDEN, hidden=(2,))), (0.2, scene(FAR, LEFT, HIDDEN, hidden=(3,)))
     ).objects()
