@@ -12,6 +12,7 @@ from mstfilter import __version__
 
 if TYPE_CHECKING:
     from mstfilter.app.report import RunNumbers
+    from mstfilter.runs import RunFolder
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -76,17 +77,26 @@ def read_source(path: Path, format: str, options: list[str] | None, pauses: str)
         return open_recording(path, format, options or (), pauses)
 
 
-def print_summary(numbers: RunNumbers) -> None:
-    """Print the gain from earlier images, and for each pause the hypotheses, objects, ESS and quality."""
-    for sentence in numbers.value_of_the_past:
-        print(sentence)
-    for t, step in enumerate(numbers.steps):
-        objects = " ".join(map(str, step.objects))
-        n = "1 hypothesis" if len(step.objects) == 1 else f"{len(step.objects)} hypotheses"
-        line = f"pause {t}     {n} of {objects} {'object' if objects == '1' else 'objects'}, "
-        line += f"ESS {step.info['ess']:.1f} of {step.info['n_candidates']} candidates"
+def print_summary(run: RunFolder, numbers: RunNumbers) -> None:
+    """Print for each pause what changed and what is believed, then hypotheses, ESS and quality."""
+    from textwrap import fill
+
+    from mstfilter.app.report.answer import answers_of_run
+    from mstfilter.app.report.identities import assign_identities
+
+    indent = 12 * " "
+    for t, (step, (answer, happened)) in enumerate(
+        zip(numbers.steps, answers_of_run(run, assign_identities(run)), strict=True)
+    ):
+        text = " ".join([*happened, *answer.sentences])
+        print(fill(f"{f'pause {t}':<12}{text}", 100, subsequent_indent=indent))
+        n = len(step.objects)
+        line = f"{n} {'hypothesis' if n == 1 else 'hypotheses'}"
+        line += f", ESS {step.info['ess']:.1f} of {step.info['n_candidates']} candidates"
         if step.mean is not None:
             line += f", quality {step.mean:.3f} (mean), {step.best:.3f} (best)"
         if step.image_score is not None:
             line += f", quality in the image {step.image_score.mean:.3f} (mean), {step.image_score.best:.3f} (best)"
-        print(line)
+        print(indent + line)
+    for sentence in numbers.value_of_the_past:
+        print(sentence)

@@ -109,10 +109,11 @@ def run(
     from mstfilter.app.report import read_numbers, write_report
     from mstfilter.runs import RunFolder
 
-    numbers = read_numbers(RunFolder.open(folder), beliefs=report or compare)
+    run = RunFolder.open(folder)
+    numbers = read_numbers(run, beliefs=report or compare)
     if report:
         print(f"report      {write_report(folder, None, numbers)}")
-    print_summary(numbers)
+    print_summary(run, numbers)
 
 
 @app.command()
@@ -136,7 +137,8 @@ def demo(
         write_report(run, work / "report.html", numbers)
     for name, file in (("recording", "recording"), ("run", "run"), ("report", "report.html")):
         print(f"{name:<12}{out / file}")
-    print_summary(numbers)
+    print_summary(RunFolder.open(out / "run"), numbers)
+    print(f"\nopen {out / 'report.html'} in a browser")
 
 
 @app.command("simulate")

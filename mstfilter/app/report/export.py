@@ -88,11 +88,19 @@ def export_mesh(
 
     Raises InputError for another ending, a scene without objects, and a file that cannot be written.
     """
-    import trimesh
-
     path = Path(path)
     kind = path.suffix[1:].lower()
     check_choice("ending of a mesh file", kind, _KINDS)
+    data = mesh_bytes(scene, kind, colours)
+    with writing(f"mesh {path}", "choose another file"), atomic_path(path) as partial:
+        partial.write_bytes(data)
+    return path
+
+
+def mesh_bytes(scene: Hypothesis | ObjectTable, kind: str, colours: Mapping[int, Colour] | None = None) -> bytes:
+    """The content of a mesh file of this kind ("glb"); see `export_mesh`."""
+    import trimesh
+
     if isinstance(scene, Hypothesis):
         meshes = {record.label: object_mesh(scene, record.label) for record in scene.objects}
     else:
@@ -110,6 +118,4 @@ def export_mesh(
     else:
         whole = trimesh.util.concatenate(list(parts.values()))
     data = whole.export(file_type=kind)
-    with writing(f"mesh {path}", "choose another file"), atomic_path(path) as partial:
-        partial.write_bytes(data.encode() if isinstance(data, str) else data)
-    return path
+    return data.encode() if isinstance(data, str) else bytes(data)

@@ -104,10 +104,10 @@ def overlay_layer(
     return out
 
 
-def shade_layer(shares: np.ndarray, colour: Colour) -> np.ndarray:
-    """A layer of one colour with opacity `shares` (H, W) in [0, 1], as (H, W, 4) uint8, not premultiplied."""
-    opacity = np.rint(255 * shares[..., None])
-    return np.concatenate([np.broadcast_to(colour, (*shares.shape, 3)) * (opacity > 0), opacity], -1).astype(np.uint8)
+def border_colour(one_object: float) -> Colour:
+    """Colour of a border: from yellow, where it certainly separates two objects, to pink, where there is one."""
+    r, g, b = np.rint(np.array([255, 214, 64]) * (1 - one_object) + np.array([244, 44, 148]) * one_object).astype(int)
+    return int(r), int(g), int(b)
 
 
 def overlay(

@@ -153,7 +153,7 @@ class RunNumbers:
 
     @property
     def value_of_the_past(self) -> list[str]:
-        """One sentence that states whether earlier images help, in a list; an empty list if a score is unknown."""
+        """What earlier images changed on this recording, a sentence in a list; empty if a score is unknown."""
         name = "single frame"
         known = [step for step in self.steps[1:] if step.belief is not None and name in step.compared_losses]
         if not known:
@@ -161,14 +161,10 @@ class RunNumbers:
         quality = float(np.mean([s.mean for s in known])), float(np.mean([s.compared[name] for s in known]))
         losses = [s.belief.row["log_loss"] for s in known if s.belief is not None]
         loss = float(np.mean(losses)), float(np.mean([s.compared_losses[name] for s in known]))
-        verdict = {
-            (True, True): "Earlier images help on this recording",
-            (False, False): "Earlier images do not help on this recording",
-        }.get((quality[0] > quality[1], loss[0] < loss[1]), "Earlier images help in one of two scores here")
         return [
-            f"{verdict}: over the pauses after the first, mean quality is {quality[0]:.3f} with them and "
-            f"{quality[1]:.3f} from each image alone (higher is better); log loss is {loss[0]:.3f} and {loss[1]:.3f} "
-            "nats (lower is better)."
+            f"Over the pauses after the first, mean quality is {quality[0]:.2f} with earlier images and "
+            f"{quality[1]:.2f} from each image alone, and log loss is {loss[0]:.2f} and {loss[1]:.2f} nats. "
+            "One recording cannot tell whether such a difference is chance."
         ]
 
 

@@ -10,24 +10,34 @@ cannot access the rest of the page. A repeated run gives an identical file, exce
 
 from __future__ import annotations
 
+from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from mstfilter.app.report.answer import Answer, answers_of_run, share
+from mstfilter.app.report.export import mesh_bytes
 from mstfilter.app.report.figures import quality_figure, reliability_figure
+from mstfilter.app.report.identities import assign_identities
 from mstfilter.app.report.page import fill_template, flatten, note_rows, seconds_text, short_text, write_page
-from mstfilter.app.report.pictures import PALETTE, close_up, data_uri, jpeg_bytes, png_bytes, shade_layer, viewpoint
+from mstfilter.app.report.pictures import (
+    border_colour,
+    close_up,
+    colour,
+    data_uri,
+    hexadecimal,
+    jpeg_bytes,
+    viewpoint,
+)
 from mstfilter.app.report.run_numbers import SLOT_TITLES, RunNumbers, read_numbers
 from mstfilter.app.report.scenes import ShownHypothesis, ShownPause, scenes_of_run
 from mstfilter.app.report.viewer import run_page
-from mstfilter.mst.belief import Belief
+from mstfilter.mst.belief import BelievedObject, ObjectTable
 from mstfilter.runs import RunFolder
 from mstfilter.scene import Camera, Hypothesis, project
 from mstfilter.scoring import forecast_table
-
-_MOST_BORDERS = 6  # with numbers, in the picture of a pause
 
 
 def write_report(
@@ -61,22 +71,66 @@ def write_report(
 
 
 def _pauses(run: RunFolder, numbers: RunNumbers) -> list[dict[str, Any]]:
-    """Image and hypotheses of each pause, for the template."""
-    scenes = scenes_of_run(run) if numbers.steps else []
+    """The answer, the image and the hypotheses of each pause, for the template."""
+    identities = assign_identities(run)
+    scenes = scenes_of_run(run, identities) if numbers.steps else []
+    found = answers_of_run(run, identities)
     volumes = [view.hypothesis for scene in scenes for view in scene.views]
     view = viewpoint(volumes, run.camera(0)) if scenes else None
-    pauses = []
-    for t, (step, scene) in enumerate(zip(numbers.steps, scenes, strict=True)):
+    pauses: list[dict[str, Any]] = []
+    for t, (step, scene, (answer, happened)) in enumerate(zip(numbers.steps, scenes, found, strict=True)):
         assert scene.camera is not None and view is not None
-        doubt = _doubt(run.belief(t), scene.camera)
-        pauses.append({"t": t, "step": step, "doubt": doubt, **scene_content(scene, volumes, view)})
+        content = scene_content(scene, volumes, view)
+        shown = {"answer": _answer(answer, mesh=t == len(found) - 1), "box": answer.box, "changes": happened}
+        pauses.append({"t": t, "step": step, **shown, **content})
     return pauses
+
+
+def _answer(answer: Answer, mesh: bool) -> dict[str, Any]:
+    """The picture, the words and the table of the objects, for the template; with `mesh`, their mesh."""
+    return {
+        "sentences": answer.sentences,
+        "outlines": [(one, hexadecimal(colour(one.number - 1))) for one in answer.outlines],
+        "borders": [(one, hexadecimal(border_colour(one.one_object))) for one in answer.borders],
+        "rows": [_object_row(one) for one in sorted(answer.table, key=lambda one: one.number)],
+        "mesh": _mesh(answer.table) if mesh else "",
+    }
+
+
+def _object_row(one: BelievedObject) -> dict[str, str]:
+    """A row of the table of objects."""
+    maybe = [f"one with {k} ({share(p)})" for k, p in one.one_with.items() if p > 0.05]
+    maybe += [f"several ({share(one.several)})"] if one.several > 0.05 else []
+    moved = float(np.linalg.norm(one.pose.translation)), float(np.degrees(one.pose.rotation.magnitude()))
+    volume, low, high = (f"{1e6 * v:.0f}" for v in (one.volume, *one.volume_range))
+    return {
+        "number": str(one.number),
+        "colour": hexadecimal(colour(one.number - 1)),
+        "exists": share(one.existence),
+        "seen": "now" if one.visible else f"hidden since pause {one.last_seen + 1}",
+        "middle": ", ".join(f"{100 * x:.0f}" for x in one.centre),
+        "spread": f"{100 * float(np.linalg.norm(one.spread)):.1f}",
+        "size": " × ".join(f"{100 * side:.0f}" for side in one.sides),
+        "volume": volume,
+        "range": f"{low} to {high}",
+        "moved": f"{100 * moved[0]:.0f} cm, {moved[1]:.0f}°" if moved[0] > 1e-3 or moved[1] > 0.5 else "",
+        "maybe": ", ".join(maybe),
+    }
+
+
+def _mesh(table: ObjectTable) -> str:
+    """The smooth objects of a table as a data URI of a .glb file; empty if there are none."""
+    if not len(table):
+        return ""
+    data = mesh_bytes(table, "glb", {one.number: colour(one.number - 1) for one in table})
+    return f"data:model/gltf-binary;base64,{b64encode(data).decode()}"
 
 
 def scene_content(scene: ShownPause, volumes: Sequence[Hypothesis], view: Camera) -> dict[str, Any]:
     """Image and hypotheses of a pause, for the template. The close-up shows all `volumes`, `view` is a viewpoint."""
     assert scene.camera is not None and scene.image is not None
-    cards = [_card(one, scene.camera, view) for one in scene.views]
+    n = sum(len(one.members) for one in scene.views)
+    cards = [_card(one, scene.camera, view, n) for one in scene.views]
     return {
         "photo": data_uri(jpeg_bytes(scene.image), "jpeg"),
         "width": scene.camera.width,
@@ -88,12 +142,12 @@ def scene_content(scene: ShownPause, volumes: Sequence[Hypothesis], view: Camera
     }
 
 
-def _card(one: ShownHypothesis, camera: Camera, view: Camera) -> dict[str, Any]:
+def _card(one: ShownHypothesis, camera: Camera, view: Camera, n: int) -> dict[str, Any]:
     """Pictures and numbers of a group of identical hypotheses, or of the ground truth, for the template."""
     # Small images are enlarged, so that contours are about as fine as on large ones.
     scale = max(1, round(960 / camera.width))
     return {
-        "name": one.name.capitalize(),
+        "name": one.name.capitalize() if one.weight is None else f"{len(one.members)} of {n}",
         "weight": one.weight,
         "n_objects": one.hypothesis.n_objects,
         "voxels_occupied": sum(one.volumes.values()),
@@ -102,20 +156,6 @@ def _card(one: ShownHypothesis, camera: Camera, view: Camera) -> dict[str, Any]:
         "voxels": one.voxels(view),
         "tags": _place_tags(project(one.hypothesis, camera), one.identity),
     }
-
-
-def _doubt(belief: Belief, camera: Camera) -> dict[str, Any] | None:
-    """Overlay that shows where the hypotheses of a pause disagree, for the template. None if all hypotheses agree."""
-    disagreement = belief.disagreement(camera)
-    if not disagreement.any():
-        return None
-    tags: list[dict[str, Any]] = []
-    for border in belief.open_borders(camera):
-        x, y = border.middle.tolist()
-        apart = all(np.hypot(tag["x"] - x, tag["y"] - y) > 0.07 * camera.width for tag in tags)
-        if apart and len(tags) < _MOST_BORDERS:
-            tags.append({"text": f"{border.one_object:.2f}".lstrip("0"), "x": x, "y": y})
-    return {"overlay": data_uri(png_bytes(shade_layer(disagreement, PALETTE[3]))), "tags": tags}
 
 
 def _place_tags(image: np.ndarray, identity: Mapping[int, int]) -> list[dict[str, Any]]:

@@ -71,9 +71,10 @@ class ShownPause:
     hidden: float = 0.0  #: weight of the hypotheses that are not shown
 
 
-def scenes_of_run(run: RunFolder) -> list[ShownPause]:
+def scenes_of_run(run: RunFolder, identities: Identities | None = None) -> list[ShownPause]:
     """The pauses of a run, each with at most twelve distinct hypotheses, the estimate first, and the truth."""
-    identities, scenes = assign_identities(run), []
+    identities = assign_identities(run) if identities is None else identities
+    scenes: list[ShownPause] = []
     view_of: dict[int, int] = {}
     for t in range(run.n_pauses):
         earlier, scene = view_of, scene_of_run(run, t, identities)

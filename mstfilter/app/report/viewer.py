@@ -93,6 +93,7 @@ def _page(
         "low": low.tolist(),
         "high": high.tolist(),
         "yaw": round(float(np.arctan2(away[0], -away[1])) - np.radians(35 if camera is not None else 0), 3),
+        "camera": None if camera is None else ((camera.position - grid.origin) / grid.voxel_size).round(1).tolist(),
         "head": head,
         "pauses": [_scene_data(scene, photos) for scene in scenes],
     }
@@ -105,6 +106,7 @@ def _page(
 def _scene_data(scene: ShownPause, photos: bool) -> dict[str, Any]:
     """Data of a pause for the script of the page. The labels in the occupied box are encoded by `encode_runs`."""
     views = []
+    voxel = scene.views[0].hypothesis.grid.voxel_size ** 3
     for view in scene.views:
         hypothesis = view.hypothesis
         box = occupied_box(hypothesis.labels > 0) or (slice(0, 0),) * 3
@@ -126,7 +128,9 @@ def _scene_data(scene: ShownPause, photos: bool) -> dict[str, Any]:
                         "label": label,
                         "id": view.identity.get(label, label),
                         "colour": hexadecimal(view.colour(label)),
-                        "text": "" if view.colours else f"{view.identity.get(label, label) + 1}: {n} voxels",
+                        "text": ""
+                        if view.colours
+                        else f"{view.identity.get(label, label) + 1}: {1e6 * n * voxel:.0f} cm³",
                     }
                     for label, n in sorted(volumes.items(), key=lambda pair: view.identity.get(pair[0], pair[0]))
                 ],

@@ -19,8 +19,9 @@ of one hypothesis, `Belief.estimate`, and asks the others about each:
   several objects of the other hypothesis.
 
 Objects where the estimate has nothing, such as a hidden object that only some hypotheses remember, follow as further
-rows. If the belief has all weighted segmentations of the last image, the first three questions about a visible object
-are asked of its pixels and of these segmentations, so the answers do not come in steps of a fifth.
+rows. Another reading of visible pixels is no further object; the questions above tell of it. If the belief has all
+weighted segmentations of the last image, the first three questions about a visible object are asked of its pixels and
+of these segmentations, so the answers do not come in steps of a fifth.
 
 An object has the number of the object of the previous table with which it shares most voxels, or from which it
 descends, one to one. The `id` of a record alone does not follow an object: another hypothesis may be the estimate
@@ -184,15 +185,15 @@ def object_table(belief: Belief, camera: Camera | None = None, previous: ObjectT
     matching = _Matching(belief)
     if camera is None and belief.seen is not None:
         camera = belief.seen.camera
+    if camera is not None:
+        matching.keep_unseen(camera)
     rows = matching.rows
     votes = [matching.votes(i, label) for i, label in rows]
     mass = [matching.mass] * len(rows)
     if camera is not None and rows:
         refined, weights = belief.refined_image(camera)
-        images: dict[int, np.ndarray] = {}
         for r, (i, label) in enumerate(rows):
-            image = images.setdefault(i, project(matching.hypotheses[i], camera))
-            shown = np.bincount(refined.cells[image == label], minlength=len(refined.sizes))
+            shown = np.bincount(refined.cells[matching.pixels(i, label, camera)], minlength=len(refined.sizes))
             if matching.is_visible(i, label) and shown.any():
                 votes[r], mass[r] = _votes(refined, shown), weights
     objects = []
@@ -280,6 +281,7 @@ class _Matching:
 
     def __init__(self, belief: Belief) -> None:
         self.belief, self.hypotheses, self.mass = belief, *belief.distinct
+        self._images: dict[int, np.ndarray] = {}
         self.refined = belief.refined_voxels
         self.shared = self.refined.overlaps()
         sizes = self.shared.diagonal()
@@ -299,6 +301,24 @@ class _Matching:
             for one in records[i]:
                 if one.label not in matched and self._is_elsewhere(i, one.label, first):
                     self.rows.append((i, one.label))
+
+    def pixels(self, i: int, label: int, camera: Camera) -> np.ndarray:
+        """Where an image shows an object of hypothesis i (H, W)."""
+        if i not in self._images:
+            self._images[i] = project(self.hypotheses[i], camera)
+        return np.asarray(self._images[i] == label)
+
+    def keep_unseen(self, camera: Camera) -> None:
+        """Remove further rows whose pixels show objects of the estimate: these are other readings of the image."""
+        if not self.rows[self.in_estimate :]:
+            return
+        taken = project(self.belief.estimate(), camera) > 0
+        further = [
+            (i, label)
+            for i, label in self.rows[self.in_estimate :]
+            if not self.is_visible(i, label) or not _most(taken[self.pixels(i, label, camera)])
+        ]
+        self.rows = self.rows[: self.in_estimate] + further
 
     def _number(self, i: int, label: int) -> int:
         """Number in the refinement of an object of a hypothesis."""
@@ -381,6 +401,11 @@ class _Matching:
             origin=grid.origin,
             voxel_size=grid.voxel_size,
         )
+
+
+def _most(values: np.ndarray) -> bool:
+    """Whether more than half of the values (n,) bool are True."""
+    return bool(2 * values.sum() > len(values))
 
 
 def _stored(hypothesis: Hypothesis, label: int) -> tuple[np.ndarray, np.ndarray]:

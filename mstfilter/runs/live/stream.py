@@ -306,7 +306,7 @@ class Stream:
 
     @property
     def objects(self) -> ObjectTable:
-        """The table of objects at the last pause (`Belief.objects`). Objects keep their numbers from table to table."""
+        """The table of objects at the last pause (`Belief.objects`), in which objects keep their numbers."""
         belief = self.belief
         if self._table is None or self._table[0] != belief.pause:
             previous = None if self._table is None else self._table[1]

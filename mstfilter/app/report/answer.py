@@ -1,0 +1,337 @@
+"""What a belief says of a scene: a picture over the image, and sentences that a person reads.
+
+>>> answer = Answer.of(belief, table, camera)
+>>> answer.sentences
+['5 objects.', '1 is hidden and remembered: 4 (.80).',
+ '1 border is open: between 2 and 3 (.47 that both sides are one object).']
+>>> answer.outlines, answer.borders             # in pixels, for SVG or matplotlib
+>>> changes(before, now)                        # what a push did, from the tables of two pauses
+['Moved: 2 (by 4 cm).', '2 and 3 are one object with probability .02 (.47 before).']
+
+The report, the console and notebooks show the same picture and the same words. No ground truth is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from mstfilter.app.report.identities import Identities
+from mstfilter.app.report.pictures import close_up
+from mstfilter.mst.belief import Belief, BelievedObject, Border, ObjectTable
+from mstfilter.runs import RunFolder
+from mstfilter.scene import Camera, project, render
+
+_APART = 0.06  # least distance of two tags, as a share of the width of the image
+_SURE = 0.05  # probabilities nearer to 0 or 1 are not mentioned
+_MOVED = 0.01  # metres
+_NEAR = 0.2  # metres within which a new object is looked for beside one that was perhaps several
+_CHANGED = 0.1  # of a probability
+_MOST = 5  # cases of a sentence that are listed
+
+Point = tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Tag:
+    """A short text in the picture, with the point that it is about."""
+
+    text: str
+    place: Point  #: of the middle of the text, (column, row)
+    about: Point
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """The outline of an object in the image; of a hidden one, where it would be seen."""
+
+    number: int
+    hidden: bool
+    path: str  #: of SVG, in pixels; empty if the object is outside the image
+    tag: Tag | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class OpenBorder:
+    """A border between one object and two."""
+
+    one_object: float  #: probability
+    numbers: tuple[int, ...]  #: of the objects on its sides, in the table: one, or two
+    path: str
+    tag: Tag
+
+    @property
+    def text(self) -> str:
+        """Where it is, in words."""
+        if len(self.numbers) == 2:
+            return f"between {self.numbers[0]} and {self.numbers[1]}"
+        return f"within {self.numbers[0]}" if self.numbers else "beside the objects"
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """The objects of a table in an image, and the borders that are open."""
+
+    table: ObjectTable
+    box: tuple[float, float, float, float]  #: part of the image to be shown: x, y, width, height in pixels
+    outlines: Sequence[Outline] = field(default_factory=tuple)
+    borders: Sequence[OpenBorder] = field(default_factory=tuple)  #: the most uncertain first
+
+    @classmethod
+    def of(cls, belief: Belief, table: ObjectTable, camera: Camera) -> Answer:
+        """The answer of a belief and its table of objects in the image of a camera."""
+        box = close_up([belief.estimate()], camera)
+        shown = box[2] / camera.width
+        image = _label_image(belief, camera)
+        tags = _Tags(camera.width, camera.height, _APART * shown * camera.width)
+        number_of = {one.label: one.number for one in table if one.in_estimate}
+        open_borders = []
+        for border in belief.open_borders(camera):
+            numbers = _numbers(border, image, number_of)
+            thick = np.zeros(image.shape, np.uint8)
+            thick[border.pixels[:, 1], border.pixels[:, 0]] = 1
+            x, y = border.middle.tolist()
+            tag = tags.place(share(border.one_object), (x + 0.5, y + 0.5))
+            path = _path(_grown(thick, max(1, round(shown * camera.width / 320))))
+            open_borders.append(OpenBorder(border.one_object, numbers, path, tag))
+        masks = [_mask(belief, one, image, camera) for one in table]
+        order = np.argsort([-int(mask.sum()) for mask in masks], kind="stable").tolist()
+        found: dict[int, Outline] = {}
+        for k in order:
+            one, at = table[k], _widest(masks[k])
+            named = None if at is None else tags.place(str(one.number), at)
+            path = _path(masks[k].astype(np.uint8), outer=True)
+            found[k] = Outline(one.number, not one.visible, path, named)
+        outlines = tuple(found[k] for k in range(len(table)))
+        return cls(table, box, outlines, tuple(open_borders))
+
+    @cached_property
+    def sentences(self) -> list[str]:
+        """How many objects there are, what is hidden, and what is open."""
+        sure = [one for one in self.table if one.in_estimate]
+        found = [f"{_count(len(sure), 'object')}."]
+        hidden = [one for one in self.table if not one.visible]
+        if hidden:
+            names = _listed([f"{one.number} ({share(one.existence)})" for one in hidden])
+            found.append(f"{len(hidden)} {'is' if len(hidden) == 1 else 'are'} hidden and remembered: {names}.")
+        n = len(self.borders)
+        if n:
+            texts = [f"{border.text} ({share(border.one_object)})" for border in self.borders]
+            texts[0] = texts[0].replace(")", " that both sides are one object)")
+            found.append(f"{n} border{' is' if n == 1 else 's are'} open: {_listed(texts)}.")
+        else:
+            found.append("No border is open.")
+        asked = {number for border in self.borders for number in border.numbers}
+        parts = [one for one in self.table if one.several > _CHANGED and one.number not in asked]
+        if parts:
+            listed = _listed([f"{one.number} ({share(one.several)})" for one in parts])
+            found.append(f"Perhaps several objects, with something between them: {listed}.")
+        return found
+
+
+def answers_of_run(run: RunFolder, identities: Identities) -> list[tuple[Answer, list[str]]]:
+    """The answer of each pause of a run, and what changed since the pause before.
+
+    The objects have the numbers that `identities` gives them in all pictures.
+    """
+    found: list[tuple[Answer, list[str]]] = []
+    for t in range(run.n_pauses):
+        belief, camera = run.belief(t), run.camera(t)
+        table = belief.objects()
+        answer = Answer.of(belief, table.renumbered(_numbers_of(table, t, identities)), camera)
+        found.append((answer, changes(found[-1][0].table, answer.table) if found else []))
+    return found
+
+
+def _numbers_of(table: ObjectTable, t: int, identities: Identities) -> list[int]:
+    """The numbers that the objects have in all pictures. An object that is believed at two places has two."""
+    found: list[int] = []
+    last = max((n for of in identities.table.values() for n in of.values()), default=0) + 1
+    for one in table:
+        number = identities.of(t, one.hypothesis)[one.label] + 1
+        if number in found:
+            last += 1
+            number = last
+        found.append(number)
+    return found
+
+
+def changes(before: ObjectTable, now: ObjectTable) -> list[str]:
+    """What happened between two pauses, in sentences; the tables have common numbers."""
+    old, new = ({one.number: one for one in table} for table in (before, now))
+    both = [(old[k], new[k]) for k in sorted(old.keys() & new.keys())]
+    parts = _parts(old, new)
+    found = []
+    shifts = [(b.number, _shift(a, b)) for a, b in both if b.number not in parts]
+    moved = [f"{k} (by {100 * shift:.0f} cm)" for k, shift in shifts if shift > _MOVED]
+    if moved:
+        found.append(f"Moved: {_listed(moved)}.")
+    for a, b in both:
+        for other in sorted({*a.one_with, *b.one_with}):
+            if a.number < other and other in new and other in old:
+                p, q = a.one_with.get(other, 0.0), b.one_with.get(other, 0.0)
+                if abs(p - q) > _CHANGED:
+                    pair = f"{a.number} and {other}"
+                    found.append(f"{pair} are one object with probability {share(q)} ({share(p)} before).")
+    for a, b in both:
+        if a.number in parts:
+            found.append(f"{a.number} is two objects, {a.number} and {parts[a.number]} ({share(a.several)} before).")
+        elif abs(a.several - b.several) > _CHANGED:
+            found.append(
+                f"{a.number} is several objects with probability {share(b.several)} ({share(a.several)} before)."
+            )
+    gone = [b for a, b in both if a.visible and not b.visible]
+    found += [f"{one.number} is hidden now, and is remembered ({share(one.existence)})." for one in gone]
+    found += [f"{b.number} is seen again." for a, b in both if b.visible and not a.visible]
+    fresh = [str(k) for k in sorted(new.keys() - old.keys()) if k not in parts.values()]
+    if fresh:
+        found.append(f"New: {_listed(fresh)}.")
+    lost = [f"{k} ({share(old[k].existence)} before)" for k in sorted(old.keys() - new.keys())]
+    if lost:
+        found.append(f"No longer there: {_listed(lost)}.")
+    return found or ["Nothing changed."]
+
+
+def _shift(before: BelievedObject, now: BelievedObject) -> float:
+    """How far an object has moved, metres. A middle that only its new shape has moved does not count."""
+    same = before.record.id == now.record.id
+    if same and np.allclose(before.pose.as_matrix(), now.pose.as_matrix()):
+        return 0.0
+    return float(np.linalg.norm(now.centre - before.centre))
+
+
+def share(p: float) -> str:
+    """A probability with two digits, such as .47; .00 and 1.00 are written so."""
+    text = f"{p:.2f}"
+    return text[1:] if text.startswith("0") else text
+
+
+def _count(n: int, name: str) -> str:
+    return f"{n} {name}{'' if n == 1 else 's'}"
+
+
+def _listed(items: Sequence[str], separator: str = ", ") -> str:
+    more = len(items) - _MOST
+    return separator.join(items[:_MOST]) + (f" and {more} more" if more > 0 else "")
+
+
+def _parts(old: dict[int, BelievedObject], new: dict[int, BelievedObject]) -> dict[int, int]:
+    """New objects that were parts of one that was perhaps several, by the number of the latter."""
+    found: dict[int, int] = {}
+    for k in sorted(new.keys() - old.keys()):
+        near = [
+            (float(np.linalg.norm(one.centre - new[k].centre)), number)
+            for number, one in old.items()
+            if one.several > _SURE and number in new and number not in found and new[k].visible
+        ]
+        if near and min(near)[0] < _NEAR:
+            found[min(near)[1]] = k
+    return found
+
+
+def _numbers(border: Border, image: np.ndarray, number_of: dict[int, int]) -> tuple[int, ...]:
+    """The objects of the estimate that most pixels of both sides of a border show."""
+    found = []
+    for side in border.sides:
+        counts = np.bincount(image[side], minlength=1)
+        counts[0] = 0
+        if counts.any() and (number := number_of.get(int(counts.argmax()))) and number not in found:
+            found.append(number)
+    return tuple(sorted(found))
+
+
+def _label_image(belief: Belief, camera: Camera) -> np.ndarray:
+    """The label (H, W) of the estimate at each pixel.
+
+    Voxels are coarser than pixels. If the segmentations of this image are known, each of their cells has the label
+    that most of its pixels show, so outlines are those of the image.
+    """
+    image = project(belief.estimate(), camera)
+    if belief.seen is None or not belief.seen.are_of(camera):
+        return image
+    cells, n = belief.seen.cells.astype(np.int64), int(image.max()) + 1
+    counts = np.bincount((cells * n + image).ravel(), minlength=(int(cells.max()) + 1) * n).reshape(-1, n)
+    shown = np.where(counts[:, 1:].sum(axis=1) > 0.5 * counts.sum(axis=1), 1 + counts[:, 1:].argmax(axis=1), 0)
+    shown[0] = 0
+    return np.asarray(shown[cells])
+
+
+def _mask(belief: Belief, one: BelievedObject, image: np.ndarray, camera: Camera) -> np.ndarray:
+    """Where an object is in the image (H, W) bool; of a hidden one, as if nothing were in front of it."""
+    if one.in_estimate and one.visible:
+        return _closed(image == one.label)
+    hypothesis = belief.hypotheses[one.hypothesis]
+    alone = (hypothesis.labels == one.label).astype(np.uint16)
+    return render(alone, hypothesis.grid, camera).labels > 0
+
+
+def _closed(mask: np.ndarray) -> np.ndarray:
+    """A mask (H, W) without narrow gaps, such as pixels without a reading, and without specks."""
+    import cv2
+
+    size = 2 * max(1, round(mask.shape[1] / 160)) + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    whole = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, disc)
+    n, parts, stats, _ = cv2.connectedComponentsWithStats(whole)
+    if n < 2:
+        return mask
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    return np.asarray(np.isin(parts, 1 + np.flatnonzero(areas > 0.03 * areas.max())))
+
+
+def _grown(mask: np.ndarray, pixels: int) -> np.ndarray:
+    import cv2
+
+    size = 2 * pixels + 1
+    return cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
+
+
+def _path(mask: np.ndarray, outer: bool = False) -> str:
+    """The contours of a mask (H, W) uint8 as a path of SVG, or the `outer` ones alone.
+
+    Pixel (0, 0) is the square from (0, 0) to (1, 1).
+    """
+    import cv2
+
+    mode = cv2.RETR_EXTERNAL if outer else cv2.RETR_CCOMP
+    contours, _ = cv2.findContours(mask, mode, cv2.CHAIN_APPROX_NONE)
+    texts = []
+    for contour in contours:
+        points = cv2.approxPolyDP(contour, 0.7, True)[:, 0]
+        if len(points) > 2:
+            texts.append("M" + " ".join(f"{x + 0.5:g},{y + 0.5:g}" for x, y in points.tolist()) + "Z")
+    return "".join(texts)
+
+
+def _widest(mask: np.ndarray) -> Point | None:
+    """The point of a mask that is farthest from its border."""
+    from scipy.ndimage import distance_transform_edt
+
+    if not mask.any():
+        return None
+    inside = distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
+    row, column = np.unravel_index(int(inside.argmax()), mask.shape)
+    return float(column) + 0.5, float(row) + 0.5
+
+
+class _Tags:
+    """Places for texts, so that none covers another."""
+
+    def __init__(self, width: int, height: int, apart: float) -> None:
+        self.size, self.apart = np.array([width, height], float), apart
+        self.taken: list[np.ndarray] = []
+
+    def place(self, text: str, about: Point) -> Tag:
+        """The nearest free place to a point."""
+        apart, at = self.apart, np.array(about)
+        angles = np.arange(16) * np.pi / 8
+        ring = np.column_stack([np.cos(angles), np.sin(angles)])
+        tried = np.concatenate([at[None], *(at + radius * apart * ring for radius in (0.8, 1.2, 1.7, 2.3))])
+        tried = tried[((tried > apart / 3) & (tried < self.size - apart / 3)).all(axis=1)]
+        free = [p for p in tried if all(np.linalg.norm((p - q) * (1, 1.4)) > apart for q in self.taken)]
+        x, y = (free[0] if free else np.clip(at, apart / 3, self.size - apart / 3)).tolist()
+        self.taken.append(np.array([x, y]))
+        return Tag(text, (x, y), about)
