@@ -75,7 +75,7 @@ def test_a_page_holds_the_labels(tmp_path):
     check_html(page.save(tmp_path / "scene.html").read_text())
     view = data_of(page)["pauses"][0]["views"][0]
     assert np.array_equal(volume(view, LABELS.shape), LABELS)
-    assert {o["text"] for o in view["objects"]} == {f"{k}: {n} voxels" for k, n in SMALL.volumes().items()}
+    assert {o["text"] for o in view["objects"]} == {f"{k}: {n} cm³" for k, n in SMALL.volumes().items()}
     with pytest.raises(InputError, match="is a folder"):
         page.save(tmp_path)
 

@@ -1,0 +1,129 @@
+"""The answer of a belief: outlines and borders where they are in the image, and sentences that say what is known."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mstfilter.app.report.answer import Answer, changes, share
+from mstfilter.scene import WeightedSegmentations, project
+from tests.mst.belief.test_objects import CAMERA, FAR, HIDDEN, LEFT, RIGHT, at, belief_of, scene, two_readings
+
+
+def polygons(path):
+    """The vertices of each polygon of a path of SVG."""
+    return [
+        np.array([[float(x) for x in pair.split(",")] for pair in part.split()])
+        for part in re.findall(r"M([^Z]*)Z", path)
+    ]
+
+
+def answer_of(belief, table=None):
+    return Answer.of(belief, belief.objects() if table is None else table, CAMERA)
+
+
+def test_sentences_and_borders_of_two_readings():
+    belief = two_readings(p_one=0.25)
+    table = belief.objects()
+    answer = answer_of(belief, table)
+    left, right, hidden = (at(table, box).number for box in (LEFT, RIGHT, HIDDEN))
+    assert answer.sentences == [
+        "4 objects.",
+        f"1 is hidden and remembered: {hidden} (.60).",
+        f"1 border is open: between {left} and {right} (.25 that both sides are one object).",
+    ]
+    [border] = answer.borders
+    assert border.numbers == (left, right) and border.tag.text == ".25"
+    # The border is drawn where the boxes touch: the plane x = -0.04 m.
+    x, _ = CAMERA.project(np.array([[-0.04, -0.05, 0.0], [-0.04, 0.02, 0.09]]))[0].T
+    drawn = np.concatenate(polygons(border.path))
+    assert x.min() - 4 < drawn[:, 0].min() and drawn[:, 0].max() < x.max() + 4
+
+
+def test_outlines_are_those_of_the_objects():
+    belief = two_readings()
+    table = belief.objects()
+    answer = answer_of(belief, table)
+    image = project(belief.estimate(), CAMERA)
+    for one, outline in zip(table, answer.outlines, strict=True):
+        assert outline.number == one.number and outline.hidden == (not one.visible)
+        points = np.concatenate(polygons(outline.path))
+        if one.visible:
+            rows, columns = np.nonzero(image == one.label)
+            np.testing.assert_allclose(points.min(axis=0), (columns.min() + 0.5, rows.min() + 0.5), atol=1.5)
+            np.testing.assert_allclose(points.max(axis=0), (columns.max() + 0.5, rows.max() + 0.5), atol=1.5)
+        else:  # where it would be seen if nothing were in front of it
+            uv = CAMERA.project(belief.grid.centre_of(np.argwhere(belief.estimate().labels == one.label)))[0]
+            np.testing.assert_allclose(
+                (points.min(axis=0), points.max(axis=0)), (uv.min(axis=0), uv.max(axis=0)), atol=5
+            )
+        assert outline.tag is not None and outline.tag.text == str(one.number)
+
+
+def test_tags_have_room():
+    answer = answer_of(two_readings())
+    tags = [one.tag for one in (*answer.outlines, *answer.borders)]
+    places = np.array([tag.place for tag in tags])
+    apart = np.linalg.norm(places[:, None] - places, axis=-1) + 1e9 * np.eye(len(places))
+    assert apart.min() > 0.04 * answer.box[2]
+
+
+def test_without_open_borders_and_without_objects():
+    assert answer_of(belief_of((1.0, scene(FAR)))).sentences == ["1 object.", "No border is open."]
+    assert answer_of(belief_of((1.0, scene()))).sentences == ["0 objects.", "No border is open."]
+
+
+def test_parts_with_something_between_them_are_mentioned():
+    belief = belief_of((0.6, scene([LEFT, FAR])), (0.4, scene(LEFT, FAR)))
+    assert answer_of(belief).sentences[-1] == "Perhaps several objects, with something between them: 1 (.40)."
+
+
+def test_outlines_follow_the_cells_of_the_image():
+    belief = belief_of((1.0, scene(FAR)))
+    image = project(belief.estimate(), CAMERA)
+    rows, columns = np.nonzero(image)
+    cells = np.zeros(image.shape, np.int64)
+    cells[rows.min() - 3 : rows.max() + 1, columns.min() : columns.max() + 1] = 1
+    seen = WeightedSegmentations(cells, np.array([[1]]), np.ones(1), CAMERA)
+    [outline] = answer_of(replace(belief, seen=seen)).outlines
+    assert np.concatenate(polygons(outline.path))[:, 1].min() == pytest.approx(rows.min() - 2.5, abs=0.6)
+
+
+def test_what_a_push_decided():
+    """One or two before; a push has moved one part away, hidden another object, and shown a third one again."""
+    before = two_readings(p_one=0.25).objects()
+    left, right, far, hidden = (at(before, box).number for box in (LEFT, RIGHT, FAR, HIDDEN))
+    moved = np.s_[22:30, 9:16, :9]
+    other = scene(LEFT, moved, FAR, HIDDEN, seen=2, hidden=(3,))
+    records = tuple(
+        replace(r, id=900 + r.label) if r.label == 2 else r for r in other.objects
+    )  # a new identity, so that the shift counts
+    now = belief_of((1.0, replace(other, objects=records))).objects()
+    now = now.renumbered([left, right, far, hidden])
+    assert changes(before, now) == [
+        f"Moved: {right} (by 8 cm).",
+        f"{left} and {right} are one object with probability .00 (.25 before).",
+        f"{far} is hidden now, and is remembered (1.00).",
+        f"{hidden} is seen again.",
+    ]
+    assert changes(before, before) == ["Nothing changed."]
+
+
+def test_one_that_turns_out_to_be_two_new_ones_and_lost_ones():
+    before = belief_of((0.6, scene([LEFT, RIGHT], FAR)), (0.4, scene(LEFT, RIGHT, FAR))).objects()
+    now = belief_of((1.0, scene(LEFT, np.s_[20:28, 12:19, :9], np.s_[1:5, 34:38, :3], seen=2))).objects()
+    merged, far = before[0].number, before[1].number
+    now = now.renumbered([merged, 8, 9])
+    assert changes(before, now) == [
+        f"{merged} is two objects, {merged} and 8 (.40 before).",
+        "New: 9.",
+        f"No longer there: {far} (1.00 before).",
+    ]
+
+
+@pytest.mark.parametrize(("p", "text"), [(0.474, ".47"), (0.0, ".00"), (1.0, "1.00"), (0.999, "1.00")])
+def test_share(p, text):
+    assert share(p) == text
