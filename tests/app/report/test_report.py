@@ -106,7 +106,7 @@ def test_kinds_of_runs(kind, tmp_path):
     if not kind.get("truth", True):
         assert "no ground truth" in page.text and "one blob" not in page.text and "Truth" not in page.text
     if kind.get("pauses") == 1:
-        assert "after 1 pause," in page.text
+        assert "say after 1 pause · " in page.text
     if kind.get("empty"):
         assert "0 objects. No border is open." in page.text
 
