@@ -5,6 +5,7 @@
 ['5 objects.', '1 is hidden and remembered: 4 (.80).',
  '1 border is open: between 2 and 3 (.47 that both sides are one object).']
 >>> answer.outlines, answer.borders             # in pixels, for SVG or matplotlib
+>>> plot_answer(answer, image)                  # the picture; `Belief.plot(image, camera)` draws it too
 >>> changes(before, now)                        # what a push did, from the tables of two pauses
 ['Moved: 2 (by 4 cm).', '2 and 3 are one object with probability .02 (.47 before).']
 
@@ -16,11 +17,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
+import matplotlib.style
 import numpy as np
+from matplotlib import patheffects
+from matplotlib.patches import Polygon
 
+from mstfilter.app.report.charts import Drawing
 from mstfilter.app.report.identities import Identities
-from mstfilter.app.report.pictures import close_up
+from mstfilter.app.report.pictures import border_colour, close_up, colour, hexadecimal
 from mstfilter.mst.belief import Belief, BelievedObject, Border, ObjectTable
 from mstfilter.runs import RunFolder
 from mstfilter.scene import Camera, project, render
@@ -50,8 +56,13 @@ class Outline:
 
     number: int
     hidden: bool
-    path: str  #: of SVG, in pixels; empty if the object is outside the image
+    polygons: Sequence[np.ndarray]  #: each (m, 2), (column, row); none if the object is outside the image
     tag: Tag | None = None
+
+    @property
+    def path(self) -> str:
+        """The polygons as a path of SVG."""
+        return _path(self.polygons)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +71,13 @@ class OpenBorder:
 
     one_object: float  #: probability
     numbers: tuple[int, ...]  #: of the objects on its sides, in the table: one, or two
-    path: str
+    polygons: Sequence[np.ndarray]  #: around the border; each (m, 2), (column, row)
     tag: Tag
+
+    @property
+    def path(self) -> str:
+        """The polygons as a path of SVG."""
+        return _path(self.polygons)
 
     @property
     def text(self) -> str:
@@ -95,16 +111,16 @@ class Answer:
             thick[border.pixels[:, 1], border.pixels[:, 0]] = 1
             x, y = border.middle.tolist()
             tag = tags.place(share(border.one_object), (x + 0.5, y + 0.5))
-            path = _path(_grown(thick, max(1, round(shown * camera.width / 320))))
-            open_borders.append(OpenBorder(border.one_object, numbers, path, tag))
+            around = _polygons(_grown(thick, max(1, round(shown * camera.width / 320))))
+            open_borders.append(OpenBorder(border.one_object, numbers, around, tag))
         masks = [_mask(belief, one, image, camera) for one in table]
         order = np.argsort([-int(mask.sum()) for mask in masks], kind="stable").tolist()
         found: dict[int, Outline] = {}
         for k in order:
             one, at = table[k], _widest(masks[k])
             named = None if at is None else tags.place(str(one.number), at)
-            path = _path(masks[k].astype(np.uint8), outer=True)
-            found[k] = Outline(one.number, not one.visible, path, named)
+            around = _polygons(masks[k].astype(np.uint8), outer=True)
+            found[k] = Outline(one.number, not one.visible, around, named)
         outlines = tuple(found[k] for k in range(len(table)))
         return cls(table, box, outlines, tuple(open_borders))
 
@@ -130,6 +146,43 @@ class Answer:
             listed = _listed([f"{one.number} ({share(one.several)})" for one in parts])
             found.append(f"Perhaps several objects, with something between them: {listed}.")
         return found
+
+
+@matplotlib.style.context("mstfilter.app.report.figures")
+def plot_answer(answer: Answer, image: np.ndarray) -> Drawing:
+    """The picture of an answer over the image (H, W, 3): outlines with numbers, and open borders with probabilities.
+
+    Hidden objects are dashed. The colour of a border goes from yellow (two objects) to pink (one).
+    """
+    x, y, width, height = answer.box
+    figure = Drawing(figsize=(6.4, 6.4 * height / width), layout="constrained")
+    axes = figure.subplots()
+    axes.imshow(image, extent=(0, image.shape[1], image.shape[0], 0))
+    axes.set(xlim=(x, x + width), ylim=(y + height, y))
+    axes.set_axis_off()
+    glow = [patheffects.withStroke(linewidth=3, foreground="#0c1016")]
+    for one in answer.outlines:
+        for points in one.polygons:
+            style: Any = {"linestyle": "--" if one.hidden else "-", "path_effects": glow}
+            axes.add_patch(
+                Polygon(points, fill=False, edgecolor=hexadecimal(colour(one.number - 1)), lw=1.5, **style)
+            )
+    for border in answer.borders:
+        for points in border.polygons:
+            axes.add_patch(Polygon(points, facecolor=hexadecimal(border_colour(border.one_object)), edgecolor="none"))
+    tags = [(one.tag, "white", 11) for one in answer.outlines if one.tag is not None]
+    tags += [(one.tag, hexadecimal(border_colour(one.one_object)), 13) for one in answer.borders]
+    for tag, ink, size in tags:
+        if np.hypot(*np.subtract(tag.place, tag.about)) > 0.0125 * width:
+            axes.plot(*zip(tag.place, tag.about, strict=True), color="white", lw=0.8)
+        place: Any = {"ha": "center", "va": "center", "fontsize": size, "fontweight": "bold"}
+        axes.text(*tag.place, tag.text, color=ink, path_effects=glow, **place)
+    return figure
+
+
+def plot_belief(belief: Belief, image: np.ndarray, camera: Camera) -> Drawing:
+    """The picture of a belief over the image (H, W, 3) of a camera; see `plot_answer`."""
+    return plot_answer(Answer.of(belief, belief.objects(camera), camera), image)
 
 
 def answers_of_run(run: RunFolder, identities: Identities) -> list[tuple[Answer, list[str]]]:
@@ -289,21 +342,18 @@ def _grown(mask: np.ndarray, pixels: int) -> np.ndarray:
     return cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
 
 
-def _path(mask: np.ndarray, outer: bool = False) -> str:
-    """The contours of a mask (H, W) uint8 as a path of SVG, or the `outer` ones alone.
-
-    Pixel (0, 0) is the square from (0, 0) to (1, 1).
-    """
+def _polygons(mask: np.ndarray, outer: bool = False) -> list[np.ndarray]:
+    """The contours of a mask (H, W) uint8, or the `outer` ones alone. Pixel (0, 0) is the square to (1, 1)."""
     import cv2
 
     mode = cv2.RETR_EXTERNAL if outer else cv2.RETR_CCOMP
     contours, _ = cv2.findContours(mask, mode, cv2.CHAIN_APPROX_NONE)
-    texts = []
-    for contour in contours:
-        points = cv2.approxPolyDP(contour, 0.7, True)[:, 0]
-        if len(points) > 2:
-            texts.append("M" + " ".join(f"{x + 0.5:g},{y + 0.5:g}" for x, y in points.tolist()) + "Z")
-    return "".join(texts)
+    found = [cv2.approxPolyDP(contour, 0.7, True)[:, 0] + 0.5 for contour in contours]
+    return [points for points in found if len(points) > 2]
+
+
+def _path(polygons: Sequence[np.ndarray]) -> str:
+    return "".join("M" + " ".join(f"{x:g},{y:g}" for x, y in points.tolist()) + "Z" for points in polygons)
 
 
 def _widest(mask: np.ndarray) -> Point | None:

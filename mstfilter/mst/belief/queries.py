@@ -138,6 +138,10 @@ class Belief:
 
     _repr_html_ = late("mstfilter.app.report.display:to_html", "What a notebook shows.")
 
+    plot = late(
+        "mstfilter.app.report.answer:plot_belief", "Objects and open borders over an image (H, W, 3) of a camera."
+    )
+
     def __len__(self) -> int:
         return len(self.population)
 
