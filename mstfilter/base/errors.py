@@ -209,6 +209,10 @@ def install_hint(library: str) -> str:
 _PACKAGES = {
     "cv2": "opencv-python-headless",
     "rosbags": "'mstfilter[bags]'",
+    "mcap": "'mstfilter[bags]'",
+    "mcap_protobuf": "'mstfilter[bags]'",
+    "OpenEXR": "'mstfilter[exr]'",
+    "lzfse": "'mstfilter[record3d]'",
     "onnxruntime": "'mstfilter[onnx]'",
     "xarray": "'mstfilter[xarray]'",
     "distributed": "'mstfilter[cluster]'",

@@ -109,6 +109,11 @@ def decode_image(data: bytes, flags: int, problem: str, *hints: str) -> np.ndarr
     return image
 
 
+def is_depth_png(data: bytes) -> bool:
+    """Whether the first bytes of a file are those of a PNG with one channel of 16 bits."""
+    return data.startswith(b"\x89PNG\r\n\x1a\n") and data[24:26] == b"\x10\x00"
+
+
 def _size(data: bytes) -> tuple[int, int] | None:
     """Width and height in the header of a PNG, JPEG or TIFF file; None for other files."""
     from PIL import Image, JpegImagePlugin, PngImagePlugin, TiffImagePlugin
