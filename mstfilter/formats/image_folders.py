@@ -152,8 +152,13 @@ def check_aligned(path: Path, used: Collection[str], hint: str) -> None:
         raise InputError(text, hint.format(name=aligned[0]), f"or, if they are no depth images: rename {aligned[0]}/")
 
 
+_SCAN = re.compile(r"(\d+)-(\d{12})")  # names of Redwood's object scans: number of the frame, and microseconds
+
+
 def numbers_in(file: Path) -> list[Decimal]:
-    """The numbers in a file name."""
+    """The numbers in a file name. The time in the name of an object scan is in seconds, with decimals."""
+    if scan := _SCAN.fullmatch(file.stem):
+        return [Decimal(scan[1]), Decimal(scan[2]).scaleb(-6)]
     return [Decimal(number) for number in re.findall(r"\d+(?:\.\d+)?", file.stem)]
 
 

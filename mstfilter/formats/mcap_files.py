@@ -4,8 +4,8 @@
 ...     reader = McapMessages(path)                     # used by `BagFile` as the reader of rosbags is
 
 `foxglove.RawImage`, `CompressedImage` and `CameraCalibration` get the fields of the ROS messages with the same
-content. The library mcap reads the file, mcap-protobuf-support decodes protobuf by the schemas in the file, and rosbags
-decodes messages of ROS.
+content. The library mcap reads the file, mcap-protobuf-support decodes protobuf by the schemas in the file, and
+rosbags decodes messages of ROS.
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ def _as_ros(schema: str, message: Any) -> Any:
     stamp = field("timestamp")
     seconds, nanoseconds = (stamp["sec"], stamp["nsec"]) if plain else (stamp.seconds, stamp.nanos)
     time = SimpleNamespace(sec=seconds, nanosec=nanoseconds)
-    made = {"header": SimpleNamespace(stamp=time, frame_id=field("frame_id"))}
+    made: dict[str, Any] = {"header": SimpleNamespace(stamp=time, frame_id=field("frame_id"))}
     names = {
         "foxglove.RawImage": ("width", "height", "encoding", "step"),
         "foxglove.CompressedImage": ("format",),

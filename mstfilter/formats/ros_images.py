@@ -5,7 +5,8 @@
 
 Depth with encoding 16UC1 or mono16 is in units of the depth scale (millimetres by convention, REP 118). Depth with
 encoding 32FC1 is in metres. Compressed depth is a PNG or RVL (`mstfilter.formats.rvl`). In the transport
-``compressedDepth``, a header of 12 bytes precedes it: with 32FC1, a pixel is A / depth + B, and the header has A and B.
+``compressedDepth``, a header of 12 bytes precedes it. It has the numbers A and B of 32FC1, whose pixels are
+A / depth + B.
 
 Colour of 16 bits per channel is reduced to 8, and a Bayer pattern or NV12 becomes RGB. A grey image ``mono16`` counts
 as depth unless it is chosen as colour.

@@ -3,10 +3,10 @@
 >>> pixels = decode_rvl(data, 640, 480, "a message")        # (480, 640) uint16
 
 The stream alternates between runs of zeros and runs of readings: the length of each, then the differences between
-readings that follow one another, also over the zeros between them. A difference d is stored as 2 d, or as -2 d - 1 if
-it is negative. Each of these numbers is a sequence of groups of 3 bits, the lowest group first, with a fourth bit that
-is set if another group follows. Words of 32 bits hold 8 of them, the first one in the highest bits (Wilson, "Fast
-lossless depth image compression", 2017).
+readings that follow one another, also over the zeros between them. A difference d is stored as 2 d, or as -2 d - 1
+if it is negative. Each of these numbers is a sequence of groups of 3 bits, the lowest group first, with a fourth bit
+that is set if another group follows. Words of 32 bits hold 8 of them, the first one in the highest bits (Wilson,
+"Fast lossless depth image compression", 2017).
 """
 
 from __future__ import annotations
