@@ -73,9 +73,11 @@ class Intrinsics:
         names = ("fx", "fy", "cx", "cy")
         with reading(self.file, "a file of intrinsics", hint):
             if "intrinsic_matrix" in self.entries:
-                K = _four(np.reshape(self.entries["intrinsic_matrix"], (3, 3)).T)
+                K = four_intrinsics(np.reshape(self.entries["intrinsic_matrix"], (3, 3)).T)
             else:
-                K = _four([self.entries[name] for name in names] if "fx" in self.entries else self.entries["K"])
+                K = four_intrinsics(
+                    [self.entries[name] for name in names] if "fx" in self.entries else self.entries["K"]
+                )
         for name, value in zip(names, K, strict=True):
             check_number(f"{self.file}: {name}", value, hint, above=0)
         return K
@@ -106,7 +108,7 @@ class Intrinsics:
         return video
 
 
-def _four(K: Any) -> tuple[float, ...]:
+def four_intrinsics(K: Any) -> tuple[float, ...]:
     """Intrinsics fx, fy, cx, cy from four numbers, or from the nine numbers of a 3 x 3 matrix."""
     values = np.asarray(K, dtype=float)
     if values.size == 4:

@@ -62,9 +62,14 @@ def read_depth(path: File, scale: float) -> np.ndarray:
         image = _read_exr(path)
     else:
         image = _decode_file(path, cv2.IMREAD_UNCHANGED)
+    return depth_of(image, scale, f"depth image {path}")
+
+
+def depth_of(image: np.ndarray, scale: float, where: str) -> np.ndarray:
+    """Depth (H, W) float32 in metres from the stored numbers. See `read_depth`."""
     image = image.astype(image.dtype.newbyteorder("="), copy=False)
     floating = np.issubdtype(image.dtype, np.floating)
-    stored = f"depth image {path} has shape {image.shape} and type {image.dtype}"
+    stored = f"{where} has shape {image.shape} and type {image.dtype}"
     if image.dtype == np.uint8:
         hint = "8 bits, or the colours of a colour map, do not hold depth: export it with 16 bits or as floats"
         raise InputError(f"{stored}, expected one channel of 16 bits or float", hint)
@@ -74,7 +79,7 @@ def read_depth(path: File, scale: float) -> np.ndarray:
         raise InputError(f"{stored}, expected one channel of 16 bits or float")
     if floating:
         image = np.where(np.abs(image) < _FAR, image, 0).astype(np.float32)  # also NaN
-        check_depth(image, f"depth image {path}")
+        check_depth(image, where)
     read = (image > 0) & (image != 65535)
     return np.where(read, image * np.float32(1 if floating else scale), np.float32(np.nan)).astype(np.float32)
 
@@ -93,13 +98,13 @@ def _array(path: File) -> np.ndarray:
 
 
 def _read_exr(path: File) -> np.ndarray:
-    """The depth of an OpenEXR file (H, W): its only channel, the one named Z, depth or V, or R if R, G, B are equal."""
+    """The depth (H, W) of an OpenEXR file: its only channel, or Z, depth or V, or R if R, G and B are equal."""
     try:
         import OpenEXR
     except ImportError as error:
         convert = "or convert the images to .npy or 16-bit .png"
         raise missing_library(error, "depth in OpenEXR files", convert, library="OpenEXR") from error
-    data = _content(path)
+    data = file_content(path)
     with tempfile.TemporaryDirectory() as folder, reading(Path(str(path)), "an image"):
         file = Path(folder) / "depth.exr"  # the library reads files only
         file.write_bytes(data)
@@ -190,7 +195,7 @@ def _size(data: bytes) -> tuple[int, int] | None:
         return None
 
 
-def _content(path: File) -> bytes:
+def file_content(path: File) -> bytes:
     """The bytes of a file or of a member of an archive."""
     if isinstance(path, Path):
         with reading(path, "an image"):
@@ -204,7 +209,7 @@ def _content(path: File) -> bytes:
 
 
 def _decode_file(path: File, flags: int) -> np.ndarray:
-    data = _content(path)
+    data = file_content(path)
     # The decoder would fill the missing rows with zeros without an error.
     if data.startswith(b"\x89PNG") and not data.endswith(b"IEND\xaeB\x60\x82"):
         raise InputError(f"image is truncated: {path} ({len(data)} bytes, no end of PNG)", "copy the file again")

@@ -28,6 +28,7 @@ from mstfilter.formats.image_folders import (
     seconds_in,
 )
 from mstfilter.formats.images import COLOUR_SUFFIXES, DEPTH_SUFFIXES
+from mstfilter.formats.known_layout import KnownLayout
 from mstfilter.formats.video import Video, VideoFormat, pair_stamps
 from mstfilter.scene import Frame
 
@@ -63,7 +64,7 @@ class Redwood(VideoFormat):
 
     @classmethod
     def detects(cls, path: Path) -> bool:
-        if not (path / "depth").is_dir() or is_recording(path) or (path / "scene_camera.json").is_file():
+        if not (path / "depth").is_dir() or is_recording(path) or KnownLayout.detects(path):
             return False
         folders = tuple(name for name in _COLOUR if name != "rgb" or not (path / "rgb.txt").is_file())
         return any((path / name).is_dir() for name in folders)
