@@ -21,6 +21,7 @@ import numpy as np
 from mstfilter.base.errors import InputError, check_number, warn_user
 from mstfilter.base.files import reading
 from mstfilter.base.reading import MAX_TEXT, read_bytes, read_json
+from mstfilter.formats.images import File
 from mstfilter.formats.video import Video, VideoFormat, warn_of_unread
 
 INTRINSICS = ("intrinsic.json", "camera_intrinsic.json", "intrinsics.json", "camera.json")
@@ -157,14 +158,15 @@ def check_aligned(path: Path, used: Collection[str], hint: str) -> None:
 _SCAN = re.compile(r"(\d+)-(\d{12})")  # names of Redwood's object scans: number of the frame, and microseconds
 
 
-def numbers_in(file: Path) -> list[Decimal]:
+def numbers_in(file: File) -> list[Decimal]:
     """The numbers in a file name. The time in the name of an object scan is in seconds, with decimals."""
-    if scan := _SCAN.fullmatch(file.stem):
+    stem = file.name.rpartition(".")[0]
+    if scan := _SCAN.fullmatch(stem):
         return [Decimal(scan[1]), Decimal(scan[2]).scaleb(-6)]
-    return [Decimal(number) for number in re.findall(r"\d+(?:\.\d+)?", file.stem)]
+    return [Decimal(number) for number in re.findall(r"\d+(?:\.\d+)?", stem)]
 
 
-def number_of(file: Path) -> Decimal:
+def number_of(file: File) -> Decimal:
     """The last number in a file name, or -1 for a name without numbers."""
     return (numbers_in(file) or [Decimal(-1)])[-1]
 

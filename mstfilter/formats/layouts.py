@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import re
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
@@ -22,13 +23,13 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from mstfilter.base.errors import InputError
 from mstfilter.base.files import reading
 from mstfilter.base.reading import MAX_TEXT, read_arrays, read_bytes
 from mstfilter.formats.image_folders import four_intrinsics, number_of
-from mstfilter.formats.images import File, read_depth, read_labels
+from mstfilter.formats.images import File, file_content, read_depth, read_labels
 from mstfilter.formats.record3d import read_lzfse_depth
 
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # axes right, up, back of OpenGL and ARKit: to right, down, forward
@@ -70,17 +71,14 @@ class Files:
     def text(self, *patterns: str) -> str:
         """The text of the first file."""
         file = self.one(*patterns)
-        if isinstance(file, Path):
-            return read_bytes(file, "a recording", limit=MAX_TEXT).decode("utf-8-sig")
+        data = file_content(file)
         with reading(Path(str(file)), "a recording"):
-            if file.root.getinfo(file.at).file_size > MAX_TEXT:
-                raise InputError(f"{file} has more than {MAX_TEXT} bytes, the most that are parsed")
-            return str(file.read_text(encoding="utf-8-sig"))
+            if len(data) > MAX_TEXT:
+                raise InputError(f"{file} has {len(data)} bytes, at most {MAX_TEXT} are parsed")
+            return data.decode("utf-8-sig")
 
     def json(self, *patterns: str) -> dict[str, Any]:
         """The object of the first file, in JSON."""
-        import json
-
         with reading(Path(str(self.one(*patterns))), "a recording"):
             stored = json.loads(self.text(*patterns))
             if not isinstance(stored, dict):
@@ -105,11 +103,9 @@ class Sensor:
     size: tuple[int, int] | None = None  #: width and height of the colour image to which K belongs
 
 
-#: Intrinsics, pose and time of each frame, from its colour file and number; None for a frame that cannot be used.
-Sensors = Callable[[Files, Sequence[File], Sequence[Decimal]], Sequence[Sensor | None]]
-#: From the files of a recording: a function that reads the label image or mask of a frame from its colour file.
+_Sensors = Iterator[Sensor | None]
+#: From the files of a recording: a function that reads the label image of a frame, by its colour file.
 Labels = Callable[[Files], Callable[[File], np.ndarray | None]]
-_NONE: Labels = lambda files: lambda colour: None  # noqa: E731
 
 
 @dataclass(frozen=True)
@@ -120,11 +116,12 @@ class Layout:
     signs: tuple[str, ...]  #: a folder with a file of each of these patterns has this layout
     colour: tuple[str, ...]  #: patterns of colour images, or a video; the first that is there is read
     depth: tuple[str, ...]
-    sensors: Sensors
-    labels: Labels = _NONE  #: true label images (H, W), 0 for background
+    #: What is known of each frame, by its colour file and number; None for a frame that cannot be used.
+    sensors: Callable[[Files, Sequence[Any], Sequence[Decimal]], _Sensors]
+    labels: Labels = lambda files: lambda colour: None  #: true label images (H, W), 0 for background
     hands: bool = False  #: whether label 255 is a hand or robot
     read_depth: Callable[[Files], Callable[[File, float], np.ndarray]] = lambda files: read_depth
-    unit: float = 0.001  #: metres per unit of integer depth
+    unit: float = 0.001  #: metres per unit of integer depth, and of depth that is stored again
     fps: float = 30.0  #: frames per second, if nothing has the times
     intrinsics: str = ""  #: where to get K, if the layout does not have it
     note: str = ""  #: what the user should know of the data
@@ -135,81 +132,69 @@ def find_layouts(files: Files) -> list[str]:
     return [name for name, layout in LAYOUTS.items() if all(map(files.has, layout.signs))]
 
 
-def _pose(matrix: Any) -> np.ndarray | None:
-    """A matrix (4, 4) of a pose, or None if a tracker that was lost wrote it."""
-    pose = np.reshape(np.asarray(matrix, float), (4, 4))
-    return pose if np.isfinite(pose).all() else None
-
-
 def _rigid(R: Any, t: Any) -> np.ndarray:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = np.reshape(R, (3, 3)), t
     return pose
 
 
-def _stray(files: Files, colour: Sequence[File], numbers: Sequence[Decimal]) -> list[Sensor | None]:
+def _stray(files: Files, colour: Sequence[Any], numbers: Sequence[Decimal]) -> _Sensors:
     """Stray Scanner: one row of odometry.csv for each frame; newer versions of the app write K in it."""
     shared = four_intrinsics(files.numbers("camera_matrix.csv"))
     with reading(files.path / "odometry.csv", "a table of poses"):
         table = csv.DictReader(io.StringIO(files.text("odometry.csv")), skipinitialspace=True)
         rows = {int(float(row["frame"])): {k: float(v) for k, v in row.items() if k and v} for row in table}
-        found: list[Sensor | None] = []
-        for number in numbers:
-            row = rows.get(int(number))
+        for row in map(rows.get, map(int, numbers)):
             if row is None:
-                found.append(None)
+                yield None
                 continue
             R = Rotation.from_quat([row[k] for k in ("qx", "qy", "qz", "qw")]).as_matrix()
             K = tuple(row[k] for k in ("fx", "fy", "cx", "cy")) if row.get("fx") else shared
-            found.append(Sensor(K, pose=_rigid(R, [row[k] for k in "xyz"]), time=row["timestamp"]))
-        return found
+            yield Sensor(K, pose=_rigid(R, [row[k] for k in "xyz"]), time=row["timestamp"])
 
 
-def _arkit(files: Files, colour: Sequence[File], numbers: Sequence[Decimal]) -> list[Sensor | None]:
+def _arkit(files: Files, colour: Sequence[Any], numbers: Sequence[Decimal]) -> _Sensors:
     """ARKitScenes: a .pincam for each image, and poses (world to camera, axis and angle) at 10 Hz, to interpolate."""
-    folder = colour[0].parent.name
-    cameras = files.find(f"{folder}_intrinsics/*.pincam")
+    folder = f"{colour[0].parent.name}_intrinsics"
+    cameras = files.find(f"{folder}/*.pincam")
     if not cameras:
-        raise InputError(f"{files.path}: {folder}_intrinsics/ has no .pincam file", "download it too")
+        raise InputError(f"{files.path}: {folder}/ has no .pincam file", "download it too")
     stamps = np.array([float(number_of(file)) for file in cameras])
-    seconds = np.array([float(number) for number in numbers])
-    poses: list[np.ndarray | None] = [None] * len(seconds)
-    inside = np.ones(len(seconds), bool)
-    if files.find("*.traj"):
-        with reading(Path(str(files.one("*.traj"))), "a trajectory"):
-            table = files.numbers("*.traj")
-            t, inverse = table[:, 0], Rotation.from_rotvec(table[:, 1:4]).inv()
-            inside = (seconds >= t[0] - 0.05) & (seconds <= t[-1] + 0.05)
-            clipped = seconds.clip(t[0], t[-1])
-            R = Slerp(t, inverse)(clipped).as_matrix() if len(t) > 1 else inverse.as_matrix().repeat(len(clipped), 0)
-            centres = -inverse.apply(table[:, 4:7])
-            p = np.stack([np.interp(clipped, t, centres[:, k]) for k in range(3)], axis=1)
-            poses = [_rigid(a, b) for a, b in zip(R, p, strict=True)]
-    found: list[Sensor | None] = []
-    for k, second in enumerate(seconds):
-        row = files.numbers(f"{folder}_intrinsics/{cameras[int(np.abs(stamps - second).argmin())].name}").ravel()
-        size, K = (int(row[0]), int(row[1])), tuple(row[2:6].tolist())
-        found.append(Sensor(K, pose=poses[k], time=second, size=size) if inside[k] else None)
-    return found
+    table = files.numbers("*.traj") if files.has("*.traj") else None
+    for second in map(float, numbers):
+        name = cameras[int(np.abs(stamps - second).argmin())].name
+        width, height, *K = files.numbers(f"{folder}/{name}").ravel().tolist()
+        pose = None if table is None else _between(table, second)
+        yield Sensor(tuple(K), pose=pose, time=second, size=(int(width), int(height)))
 
 
-def _record3d(files: Files, colour: Sequence[File], numbers: Sequence[Decimal]) -> list[Sensor | None]:
-    """Record3D: one file of metadata. K is stored column by column, and poses as quaternion and position in OpenGL."""
-    file = files.one("metadata", "metadata.json")
+def _between(table: np.ndarray, second: float) -> np.ndarray | None:
+    """The pose at a time, from rows of a time, axis and angle, and translation that map the world to the camera."""
+    k = int(np.searchsorted(table[:, 0], second).clip(1, max(len(table) - 1, 1)))
+    rows = table[k - 1 : k + 1]
+    if not rows[0, 0] - 0.05 <= second <= rows[-1, 0] + 0.05:
+        return None
+    share = float(np.clip((second - rows[0, 0]) / max(np.ptp(rows[:, 0]), 1e-9), 0, 1))
+    R = Rotation.from_rotvec(rows[:, 1:4]).inv()
+    centres = -R.apply(rows[:, 4:7])
+    turned = R[0] * Rotation.from_rotvec(share * (R[0].inv() * R[-1]).as_rotvec())
+    return _rigid(turned.as_matrix(), (1 - share) * centres[0] + share * centres[-1])
+
+
+def _record3d(files: Files, colour: Sequence[Any], numbers: Sequence[Decimal]) -> _Sensors:
+    """Record3D: a file of metadata. K is stored by columns; a pose is quaternion and position in axes of OpenGL."""
     stored = files.json("metadata", "metadata.json")
-    with reading(Path(str(file)), "the metadata of Record3D"):
+    with reading(Path(str(files.one("metadata", "metadata.json"))), "the metadata of Record3D"):
         shared = four_intrinsics(np.reshape(stored["K"], (3, 3)).T)
         each, poses, times = (stored.get(n) or [] for n in ("perFrameIntrinsicCoeffs", "poses", "frameTimestamps"))
         size = (int(stored["w"]), int(stored["h"])) if "w" in stored and "h" in stored else None
-        found: list[Sensor | None] = []
         for k in map(int, numbers):
             K = tuple(map(float, each[k][:4])) if k < len(each) else shared
+            time = float(times[k]) if k < len(times) else k / float(stored.get("fps") or 30)
             pose = None
             if k < len(poses):
                 pose = _rigid(Rotation.from_quat(poses[k][:4]).as_matrix(), poses[k][4:7]) @ _OPENGL
-            time = float(times[k]) if k < len(times) else k / float(stored.get("fps") or 30)
-            found.append(None if poses and pose is None else Sensor(K, pose=pose, time=time, size=size))
-        return found
+            yield Sensor(K, pose=pose, time=time, size=size)
 
 
 def _record3d_depth(files: Files) -> Callable[[File, float], np.ndarray]:
@@ -219,33 +204,29 @@ def _record3d_depth(files: Files) -> Callable[[File, float], np.ndarray]:
     return lambda file, scale: read_lzfse_depth(file, shape, aspect)
 
 
-def _bop(files: Files, colour: Sequence[File], numbers: Sequence[Decimal]) -> list[Sensor | None]:
+def _bop(files: Files, colour: Sequence[Any], numbers: Sequence[Decimal]) -> _Sensors:
     """BOP: an entry of scene_camera.json for each image; lengths are in millimetres."""
     stored = files.json("scene_camera.json")
-    found: list[Sensor | None] = []
     with reading(files.path / "scene_camera.json", "the cameras of a BOP scene"):
-        for number in numbers:
-            if (entry := stored.get(str(int(number)))) is None:
-                found.append(None)
+        for entry in (stored.get(str(int(number))) for number in numbers):
+            if entry is None:
+                yield None
                 continue
             pose = None
             if "cam_R_w2c" in entry:
                 pose = np.linalg.inv(_rigid(entry["cam_R_w2c"], np.asarray(entry["cam_t_w2c"], float) / 1000))
-            unit = float(entry.get("depth_scale", 1.0)) / 1000
-            found.append(Sensor(four_intrinsics(entry["cam_K"]), pose=pose, unit=unit))
-    return found
+            yield Sensor(four_intrinsics(entry["cam_K"]), pose=pose, unit=float(entry.get("depth_scale", 1)) / 1000)
 
 
 def _bop_labels(files: Files) -> Callable[[File], np.ndarray | None]:
-    """Masks of the visible parts. Objects have their numbers in scene_gt.json, or that of the mask if one is twice."""
-    stored = files.json("scene_gt.json") if files.find("scene_gt.json") else {}
+    """Masks of the visible parts. Objects have their numbers in scene_gt.json, or those of masks if one is twice."""
+    stored = files.json("scene_gt.json") if files.has("scene_gt.json") else {}
     objects = {key: [int(entry["obj_id"]) for entry in entries] for key, entries in stored.items()}
     alone = bool(objects) and all(len(set(ids)) == len(ids) for ids in objects.values())
 
     def read(colour: File) -> np.ndarray | None:
-        stem = colour.name.rpartition(".")[0]
         labels: np.ndarray | None = None
-        for file in files.find(f"mask_visib/{stem}_*.png"):
+        for file in files.find(f"mask_visib/{_stem(colour)}_*.png"):
             mask, k = read_labels(file), int(number_of(file))
             labels = np.zeros(mask.shape, np.uint16) if labels is None else labels
             labels[mask > 0] = objects[str(int(number_of(colour)))][k] if alone else k + 1
@@ -254,70 +235,66 @@ def _bop_labels(files: Files) -> Callable[[File], np.ndarray | None]:
     return read
 
 
-def _scannet(files: Files, colour: Sequence[File], numbers: Sequence[Decimal]) -> list[Sensor | None]:
+def _scannet(files: Files, colour: Sequence[Any], numbers: Sequence[Decimal]) -> _Sensors:
     """ScanNet: one matrix of intrinsics for colour and one for depth, and a pose for each frame."""
     of_colour, of_depth = (
-        tuple(f"{folder}{name}_{part}.txt" for folder in ("intrinsic/", "intrinsics/", "") for name in _NAMES)
+        [f"{name}_{part}.txt" for name in ("intrinsic/intrinsic", "intrinsics/intrinsic", "intrinsics", "intrinsic")]
         for part in ("color", "depth")
     )
     depth_K = four_intrinsics(files.numbers(*of_depth)[:3, :3])
     K = four_intrinsics(files.numbers(*of_colour)[:3, :3]) if files.find(*of_colour) else depth_K
-    sensors = []
     for file in colour:
-        pose = _pose(files.numbers(f"pose/{file.name.rpartition('.')[0]}.txt"))
-        sensors.append(None if pose is None else Sensor(K, depth_K, pose))
-    return sensors
+        yield Sensor(K, depth_K, files.numbers(f"pose/{_stem(file)}.txt"))
 
 
-_NAMES = ("intrinsic", "intrinsics")
-
-
-def _seven_scenes(files: Files, colour: Sequence[File], numbers: Sequence[Decimal]) -> list[Sensor | None]:
+def _seven_scenes(files: Files, colour: Sequence[Any], numbers: Sequence[Decimal]) -> _Sensors:
     """7-Scenes: a pose for each frame, and no intrinsics."""
-    poses = [_pose(files.numbers(file.name.replace(".color.png", ".pose.txt"))) for file in colour]
-    return [None if pose is None else Sensor(pose=pose) for pose in poses]
+    return (Sensor(pose=files.numbers(file.name.replace(".color.png", ".pose.txt"))) for file in colour)
 
 
-def _one_matrix(files: Files, colour: Sequence[File], numbers: Sequence[Decimal]) -> list[Sensor | None]:
+def _one_matrix(files: Files, colour: Sequence[Any], numbers: Sequence[Decimal]) -> _Sensors:
     """BundleSDF and FoundationPose: cam_K.txt."""
-    return [Sensor(four_intrinsics(files.numbers("cam_K.txt")))] * len(numbers)
+    return iter([Sensor(four_intrinsics(files.numbers("cam_K.txt")))] * len(numbers))
 
 
 def _masks(files: Files) -> Callable[[File], np.ndarray | None]:
     """The mask of the one object, often of the first frame only."""
 
     def read(colour: File) -> np.ndarray | None:
-        found = files.find(f"masks/{colour.name.rpartition('.')[0]}.png")
+        found = files.find(f"masks/{_stem(colour)}.png")
         return (read_labels(found[0]) > 0).astype(np.uint16) if found else None
 
     return read
 
 
-def _dexycb(files: Files, colour: Sequence[File], numbers: Sequence[Decimal]) -> list[Sensor | None]:
+def _dexycb(files: Files, colour: Sequence[Any], numbers: Sequence[Decimal]) -> _Sensors:
     """DexYCB: the folder of one still camera, with its intrinsics in calibration/ beside the subjects."""
     folder = files.path.resolve()
-    calibration = folder.parents[min(2, len(folder.parents) - 1)] / "calibration" / "intrinsics"
+    calibration = folder / "../../../calibration/intrinsics"
     stored = next(iter(sorted(calibration.glob(f"{folder.name}_*.yml"))), None)
-    if stored is None:
-        return [Sensor()] * len(numbers)
-    with reading(stored, "intrinsics of DexYCB"):
-        text = read_bytes(stored, "intrinsics of DexYCB", limit=MAX_TEXT).decode()
-        (block,) = re.findall(r"^color:\s*\n((?:[ \t]+.*\n?)+)", text, re.MULTILINE)
-        values = dict(re.findall(r"(\w+):\s*([-+.\deE]+)", block))
-        return [Sensor(tuple(float(values[name]) for name in ("fx", "fy", "ppx", "ppy")))] * len(numbers)
+    K: tuple[float, ...] = ()
+    if stored is not None:
+        with reading(stored, "intrinsics of DexYCB"):
+            text = read_bytes(stored, "intrinsics of DexYCB", limit=MAX_TEXT).decode()
+            (block,) = re.findall(r"^color:\s*\n((?:[ \t]+.*\n?)+)", text, re.MULTILINE)
+            values = dict(re.findall(r"(\w+):\s*([-+.\deE]+)", block))
+            K = tuple(float(values[name]) for name in ("fx", "fy", "ppx", "ppy"))
+    return iter([Sensor(K)] * len(numbers))
 
 
 def _dexycb_labels(files: Files) -> Callable[[File], np.ndarray | None]:
     """Objects 1 to 21, and 255 for the hand."""
 
     def read(colour: File) -> np.ndarray | None:
-        found = files.find(f"labels_{int(number_of(colour)):06d}.npz")
-        if not found or not isinstance(found[0], Path):
-            return None
-        with reading(found[0], "labels of DexYCB"):
-            return read_arrays(found[0], "labels of DexYCB")["seg"].astype(np.uint16)
+        file = files.path / f"labels_{int(number_of(colour)):06d}.npz"
+        with reading(file, "labels of DexYCB"):
+            return read_arrays(file, "labels of DexYCB")["seg"].astype(np.uint16) if file.is_file() else None
 
     return read
+
+
+def _stem(file: File) -> str:
+    return file.name.rpartition(".")[0]
 
 
 _RGB = ("rgb/*.png", "rgb/*.jpg", "rgb/*.jpeg")
@@ -339,9 +316,10 @@ LAYOUTS = {
         ("rgbd/*.depth",),
         _record3d,
         read_depth=_record3d_depth,
+        unit=0.00025,
     ),
     "record3d_exr": Layout(
-        "Record3D (EXR and JPG)", ("metadata.json", "depth/*.exr"), _RGB, ("depth/*.exr",), _record3d
+        "Record3D (EXR and JPG)", ("metadata.json", "depth/*.exr"), _RGB, ("depth/*.exr",), _record3d, unit=0.00025
     ),
     "arkitscenes": Layout(
         "ARKitScenes",

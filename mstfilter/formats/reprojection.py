@@ -18,7 +18,6 @@ from mstfilter.scene import Camera
 
 _SAME = 0.02  # pixels
 _SURFACE = 0.01  # share of the depth: neighbours that differ by more are on two surfaces
-_ASPECT = 0.02  # largest relative difference between the aspects of two images of the same view
 
 
 def colour_in(image: np.ndarray, source: Camera, target: Camera) -> np.ndarray:
@@ -42,8 +41,8 @@ def labels_in(image: np.ndarray, source: Camera, target: Camera) -> np.ndarray:
 def depth_in(depth: np.ndarray, source: Camera, target: Camera) -> np.ndarray:
     """A depth image (H, W) float32 of `source` as `target` sees it.
 
-    The inverse depth is interpolated, so that a plane remains a plane, except between two surfaces and at holes. There,
-    each pixel has the depth of the nearest pixel.
+    The inverse depth is interpolated, so that a plane remains a plane, except between two surfaces and at holes.
+    There, each pixel has the depth of the nearest pixel.
     """
     import cv2
 
@@ -59,20 +58,17 @@ def depth_in(depth: np.ndarray, source: Camera, target: Camera) -> np.ndarray:
 def resized_to(camera: Camera, shape: tuple[int, ...], where: str) -> Camera:
     """The camera of an image with this shape (height, width) that shows the same view.
 
-    Raises InputError if the aspects differ, since the image then shows another view.
+    Raises InputError if the sizes are not in proportion, since the image then shows another view.
     """
     height, width = shape[:2]
-    x, y = width / camera.width, height / camera.height
-    if abs(x / y - 1) > _ASPECT:
+    resized = camera.scaled(width / camera.width)
+    if abs(resized.height - height) > 1:
         raise InputError(
             f"{where} has depth of {width} x {height}, colour of {camera.width} x {camera.height}: depth is not "
             "registered to colour",
             "align depth to colour when recording (each depth pixel must belong to the colour pixel above it)",
         )
-    K, factors = camera.K.copy(), np.array([x, y])
-    K[:2, :2] *= factors[:, None]
-    K[:2, 2] = (camera.K[:2, 2] + 0.5) * factors - 0.5
-    return Camera(K, width, height)
+    return resized if resized.height == height else Camera(resized.K, width, height)
 
 
 def _same(source: Camera, target: Camera) -> bool:

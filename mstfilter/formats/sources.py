@@ -95,7 +95,8 @@ def detect_format(path: Path) -> str:
         for name, parts in _PARTS.items():
             if any(fnmatch(entry, part) for entry in entries for part in parts):
                 return name
-    if cure := _CONVERT.get(path.suffix.lower() if path.is_file() else ""):
+    cures = (cure for kinds, cure in _CONVERT.items() if path.is_file() and path.suffix.lower() in kinds.split())
+    if cure := next(cures, None):
         raise InputError(f"{path} has no known format", cure)
     raise InputError(
         f"{path} has no known format",
@@ -106,23 +107,17 @@ def detect_format(path: Path) -> str:
     )
 
 
-_ARRAYS = "read its arrays, and make a recording of them: mstfilter.Recording.from_arrays(rgb, depth, K)"
 #: Suffixes of files that are not read, and how to convert them.
 _CONVERT = {
     ".mkv": "Azure Kinect: python azure_kinect_mkv_reader.py --input FILE.mkv --output frames (an example of Open3D, "
     "which aligns depth to colour), then convert frames/; images that ffmpeg extracts are not aligned",
     ".sens": "extract the frames: reader.py --filename FILE.sens --output_path frames --export_color_images "
     "--export_depth_images --export_poses --export_intrinsics (SensReader of ScanNet), then convert frames/",
-    ".svo": "ZED: export left images and depth with the SDK of ZED as numbered 16-bit PNG, to rgb/ and depth/",
-    ".svo2": "ZED: export left images and depth with the SDK of ZED as numbered 16-bit PNG, to rgb/ and depth/",
-    ".oni": "OpenNI: play it with depth registered to colour, and write numbered 16-bit PNG, to rgb/ and depth/",
-    ".mp4": "a video of colour has no depth: give the folder that also has the depth images",
-    ".mov": "a video of colour has no depth: give the folder that also has the depth images",
-    ".h5": _ARRAYS,
-    ".hdf5": _ARRAYS,
-    ".npz": _ARRAYS,
-    ".ply": "a cloud of points has no images: record colour and depth images",
-    ".pcd": "a cloud of points has no images: record colour and depth images",
+    ".svo .svo2": "ZED: write left images and depth with its SDK as numbered images, 16-bit PNG, to rgb/ and depth/",
+    ".oni": "OpenNI: play it with depth registered to colour, and write numbered images to rgb/ and depth/",
+    ".mp4 .mov": "a video of colour has no depth: give the folder that also has the depth images",
+    ".h5 .hdf5 .npz": "read its arrays, and make a recording: mstfilter.Recording.from_arrays(rgb, depth, K)",
+    ".ply .pcd": "a cloud of points has no images: record colour and depth images",
     ".zip": "unpack it, and give the folder",
 }
 _PARTS = {

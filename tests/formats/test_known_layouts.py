@@ -18,7 +18,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from mstfilter.base.errors import InputError, InputWarning
-from mstfilter.formats import EveryNth, KnownLayout, open_recording
+from mstfilter.formats import EveryNth, KnownLayout, open_recording, save_recording
 from mstfilter.formats.layouts import LAYOUTS
 from mstfilter.formats.reprojection import colour_in, depth_in, labels_in, resized_to
 from mstfilter.formats.sources import detect_format
@@ -26,7 +26,8 @@ from mstfilter.formats.video import KnownWorld
 from mstfilter.scene import Camera
 from mstfilter.scene.camera import look_at
 from mstfilter.scene.rendering import render
-from tests.scene.scenes import GRID, table_scene
+from tests.formats.layouts import FPS, PAUSES, video
+from tests.scene.scenes import CAMERA, GRID, table_scene
 
 WIDE = Camera.from_intrinsics(262, 260, 158, 122, 320, 240)
 TALL = Camera.from_intrinsics(262, 260, 118, 162, 240, 320)  # as phones turn their images
@@ -35,9 +36,9 @@ ARKIT = Rotation.from_euler("xyz", (20, 50, 10), degrees=True)  # of the world o
 MOVED = np.array([1.0, -2.0, 0.5])
 
 
-def poses(n=len(PLACES)):
+def poses():
     """Poses T_world_camera in the world of the scene, and matrices of the same poses in the world of the recorder."""
-    true = [look_at(place, (0.02, 0, 0.03)) for place in PLACES[:n]]
+    true = [look_at(place, (0.02, 0, 0.03)) for place in PLACES]
     other = np.eye(4)
     other[:3, :3], other[:3, 3] = ARKIT.as_matrix(), MOVED
     return true, [other @ pose.as_matrix() for pose in true]
@@ -69,7 +70,7 @@ def millimetres(depth, unit=0.001):
     return np.rint(depth / unit).astype(np.uint16)
 
 
-def opened(path, n=len(PLACES), **fields):
+def opened(path, n=4, **fields):
     world = KnownWorld(tuple(poses()[0][0].as_matrix().ravel()))
     recording = KnownLayout(pauses=EveryNth(), world=world, **fields).open(path)
     assert len(recording) == n
@@ -91,11 +92,11 @@ def check(recording, within=1e-3, share=0.995, still=False, colour=0.99):
         assert np.mean(np.abs(found - true) < 45) > colour
 
 
-def write_stray(path, new=True, n=len(PLACES), small=(128, 96)):
+def write_stray(path, new=True, small=(128, 96)):
     """Stray Scanner: a video, small depth in millimetres, rows of poses with axes right, down, forward."""
     path.mkdir()
     movie = cv2.VideoWriter(str(path / "rgb.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 60, (320, 240))
-    true, stored = poses(n)
+    true, stored = poses()
     rows = ["timestamp, frame, x, y, z, qx, qy, qz, qw" + (", fx, fy, cx, cy" if new else "")]
     for k, (pose, matrix) in enumerate(zip(true, stored, strict=True)):
         wide = replace(WIDE, K=WIDE.K + k * np.array([[1.0, 0, 0.7], [0, 1.0, -0.4], [0, 0, 0]])) if new else WIDE
@@ -125,6 +126,27 @@ def test_stray_scanner(tmp_path, new):
     small = opened(path, max_pixels=20_000)
     assert small.frames[0].depth.size <= 20_100
     check(small, share=0.95)
+
+
+def test_a_phone_that_stands_still(tmp_path):
+    """The pauses are found in the video, in spite of its compression, and the pose of the camera from the table."""
+    rgb, depth, _ = video()
+    movie = cv2.VideoWriter(str(tmp_path / "rgb.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 10, (160, 120))
+    rows = ["timestamp, frame, x, y, z, qx, qy, qz, qw"]
+    for k, image in enumerate(rgb):
+        movie.write(np.ascontiguousarray(image[..., ::-1]))
+        save(tmp_path / "depth" / f"{k:06d}.png", millimetres(depth[k][1::2, 1::2]))
+        rows.append(f"{100 + k / FPS}, {k:06d}, 1, 2, 3, 0, 0, 0, 1")
+    movie.release()
+    (tmp_path / "odometry.csv").write_text("\n".join(rows) + "\n")
+    (tmp_path / "camera_matrix.csv").write_text("\n".join(", ".join(map(str, row)) for row in CAMERA.K) + "\n")
+    recording = open_recording(tmp_path, options=["pauses.levels=6"], pauses="still")
+    recording.check()
+    assert recording.pauses == PAUSES and recording.path == tmp_path
+    position = recording.frames[0].camera.position
+    assert abs(position[2] - CAMERA.position[2]) < 0.01
+    copy = open_recording(save_recording(recording, tmp_path / "out"))
+    np.testing.assert_allclose(copy.frames[2].depth, recording.frames[2].depth, atol=1.3e-4)
 
 
 def test_frames_that_ffmpeg_extracted_are_not_one_late(tmp_path):
@@ -275,7 +297,7 @@ def write_bop(path, unit=0.0001, moves=True, first=3):
 
 @pytest.mark.parametrize("moves", [False, True])
 def test_bop(tmp_path, moves):
-    """The unit is that of each scene, positions are in millimetres; objects have their numbers, but 255 is the hand."""
+    """Each scene has its unit, and positions are in millimetres; objects have their numbers, but 255 is the robot."""
     path = write_bop(tmp_path / "000048", moves=moves)
     assert detect_format(path) == "layout"
     recording = opened(path)
@@ -356,17 +378,18 @@ def test_a_folder_with_cam_k(tmp_path):
     rgb, depth, labels = table_scene(camera=WIDE.at(poses()[0][0]))
     shown = render(labels, GRID, WIDE.at(poses()[0][0])).labels
     for k in range(4):
-        save(tmp_path / "rgb" / f"1581120424{k}00148532296.png", rgb)
-        save(tmp_path / "depth" / f"1581120424{k}00148532296.png", millimetres(depth))
-    save(tmp_path / "masks" / "1581120424000148532296.png", (shown == 1).astype(np.uint8) * 255)
+        save(tmp_path / "rgb" / f"15811204241{k}0148532.png", rgb)
+        save(tmp_path / "depth" / f"15811204241{k}0148532.png", millimetres(depth))
+    save(tmp_path / "masks" / "1581120424100148532.png", (shown == 1).astype(np.uint8) * 255)
     np.savetxt(tmp_path / "cam_K.txt", WIDE.K)
     assert detect_format(tmp_path) == "layout"
     recording = opened(tmp_path)
     check(recording, still=True)
     np.testing.assert_array_equal(recording.instance(0), shown == 1)
+    np.testing.assert_allclose(recording.times, (0, 0.01, 0.02, 0.03), atol=1e-9)  # names are nanoseconds
     assert recording.instance(1) is None
     hand = np.where(np.arange(320) < 80, 255, np.zeros((240, 320))).astype(np.uint8)
-    save(tmp_path / "robot" / "1581120424100148532296.png", hand)
+    save(tmp_path / "robot" / "1581120424110148532.png", hand)
     assert opened(tmp_path).frames[1].robot_mask.mean() == 0.25
 
 

@@ -67,7 +67,7 @@ def test_unknown_and_ambiguous(tmp_path):
     [
         ("a.mkv", "azure_kinect_mkv_reader.py"),
         ("a.sens", "SensReader"),
-        ("a.svo2", "SDK of ZED"),
+        ("a.svo2", "its SDK"),
         ("a.mp4", "folder"),
     ],
 )
