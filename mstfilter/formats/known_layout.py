@@ -17,8 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.base.errors import InputError, check_choice, warn_user
+from mstfilter.base.errors import InputError, check_choice, naming, warn_user
 from mstfilter.base.fields import NonNegativeFloat
+from mstfilter.base.files import reading
 from mstfilter.formats.image_folders import mask_of, number_of, seconds_in
 from mstfilter.formats.images import File, read_optional, read_rgb
 from mstfilter.formats.layouts import LAYOUTS, Files, Layout, Sensor, find_layouts
@@ -74,7 +75,8 @@ class KnownLayout(VideoFormat):
         cameras = _cameras(sensors, picture(0).shape, str(path))
         view = cameras[0].limited(self.max_pixels).limited(self.max_pixels)  # sizes are rounded
         scales = [self.depth_scale or sensor.unit or layout.unit for sensor in sensors]
-        read_depth, labels = layout.read_depth(files), layout.labels(files)
+        with reading(path, f"a folder of {layout.title}"):
+            read_depth, labels = layout.read_depth(files), layout.labels(files)
 
         def depth_image(j: int) -> np.ndarray:
             image, K = read_depth(frames[j].depth, scales[j]), sensors[j].depth_K
@@ -88,7 +90,8 @@ class KnownLayout(VideoFormat):
             return labels_in(image, cameras[j], view)
 
         def instance(j: int) -> np.ndarray | None:
-            image = None if movie else in_view(labels(frames[j].colour), j)
+            with reading(path, "true labels"):
+                image = None if movie else in_view(labels(frames[j].colour), j)
             return image if image is None or layout.hands else object_numbers(image)
 
         def robot(j: int) -> np.ndarray | None:
@@ -149,7 +152,8 @@ class KnownLayout(VideoFormat):
         else:
             pairs = _pairs(numbers[0], numbers[1], str(path))
         listed = [numbers[0][i] for i, _ in pairs]
-        sensors = [_usable(s) for s in layout.sensors(files, [pictures[i] for i, _ in pairs], listed)]
+        with reading(path, f"a folder of {layout.title}"):
+            sensors = [_usable(s) for s in layout.sensors(files, [pictures[i] for i, _ in pairs], listed)]
         if self.K:
             sensors = [s and replace(s, K=self.K, size=None) for s in sensors]
         if any(s is not None and not s.K for s in sensors):
@@ -194,7 +198,8 @@ def _cameras(sensors: Sequence[Sensor], shape: tuple[int, ...], where: str) -> l
         if sensor.size not in (None, (width, height)):
             text = f"{where}: the intrinsics are of images of {sensor.size}, the images have {width} x {height}"
             raise InputError(text, "give those of the images: -o K=fx,fy,cx,cy")
-    made = {K: Camera(np.array(K), width, height) for K in {sensor.K for sensor in sensors}}
+    with naming(where):
+        made = {K: Camera(np.array(K), width, height) for K in {sensor.K for sensor in sensors}}
     return [made[sensor.K] for sensor in sensors]
 
 

@@ -14,6 +14,8 @@ from mstfilter.base.errors import InputError
 from mstfilter.base.files import reading
 from mstfilter.base.reading import open_regular
 
+_MOST = 10**7  # frames
+
 
 class Movie:
     """The frames of a video file, decoded in order. To go back, the file is decoded again from its beginning."""
@@ -25,6 +27,8 @@ class Movie:
             self.path = path
         self._open()
         self._n = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        if not 0 < self._n < _MOST:
+            raise InputError(f"video cannot be decoded: {path} announces {self._n} frames", "copy it again")
 
     def _open(self) -> None:
         import cv2

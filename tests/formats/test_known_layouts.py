@@ -26,7 +26,8 @@ from mstfilter.formats.video import KnownWorld
 from mstfilter.scene import Camera
 from mstfilter.scene.camera import look_at
 from mstfilter.scene.rendering import render
-from tests.formats.layouts import FPS, PAUSES, video
+from tests.formats import layouts
+from tests.formats.layouts import PAUSES
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
 WIDE = Camera.from_intrinsics(262, 260, 158, 122, 320, 240)
@@ -130,19 +131,10 @@ def test_stray_scanner(tmp_path, new):
 
 def test_a_phone_that_stands_still(tmp_path):
     """The pauses are found in the video, in spite of its compression, and the pose of the camera from the table."""
-    rgb, depth, _ = video()
-    movie = cv2.VideoWriter(str(tmp_path / "rgb.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 10, (160, 120))
-    rows = ["timestamp, frame, x, y, z, qx, qy, qz, qw"]
-    for k, image in enumerate(rgb):
-        movie.write(np.ascontiguousarray(image[..., ::-1]))
-        save(tmp_path / "depth" / f"{k:06d}.png", millimetres(depth[k][1::2, 1::2]))
-        rows.append(f"{100 + k / FPS}, {k:06d}, 1, 2, 3, 0, 0, 0, 1")
-    movie.release()
-    (tmp_path / "odometry.csv").write_text("\n".join(rows) + "\n")
-    (tmp_path / "camera_matrix.csv").write_text("\n".join(", ".join(map(str, row)) for row in CAMERA.K) + "\n")
-    recording = open_recording(tmp_path, options=["pauses.levels=6"], pauses="still")
+    path = layouts.write_stray(tmp_path / "scan")
+    recording = open_recording(path, options=["pauses.levels=6"], pauses="still")
     recording.check()
-    assert recording.pauses == PAUSES and recording.path == tmp_path
+    assert recording.pauses == PAUSES and recording.path == path
     position = recording.frames[0].camera.position
     assert abs(position[2] - CAMERA.position[2]) < 0.01
     copy = open_recording(save_recording(recording, tmp_path / "out"))
