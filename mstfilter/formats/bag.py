@@ -72,9 +72,18 @@ class BagFile:
                     raise InputError(f"bag cannot be read: {file} does not begin with #ROSBAG V2.0")
         with self._reading():
             store = get_typestore(Stores.LATEST)
-            foreign = len(files) == 1 and is_foreign(files[0])
+            if any(map(is_foreign, files)) and len(files) > 1:
+                text = f"{path} has {len(files)} MCAP files that ROS 2 has not written"
+                raise InputError(text, "give one of them, or join them: mcap merge *.mcap --output-file joined.mcap")
+            foreign = is_foreign(files[0])
             self._reader: Any = McapMessages(files[0]) if foreign else AnyReader(files, default_typestore=store)
-            self._reader.open()
+            try:
+                self._reader.open()
+            except KeyError:  # rosbags meets a schema of another kind beside those of ROS 2
+                if files[0].suffix != ".mcap" or len(files) > 1:
+                    raise
+                self._reader = McapMessages(files[0])
+                self._reader.open()
         weakref.finalize(self, _close, self._reader)
 
     def topics(self, *kinds: str) -> dict[str, int]:
@@ -222,7 +231,10 @@ class Bag(VideoFormat):
     def detects(cls, path: Path) -> bool:
         if path.is_file():
             return path.suffix in (".bag", *_PARTS)
-        return (path / "metadata.yaml").is_file() or any(entry.suffix in _PARTS for entry in path.glob("*.*"))
+        if (path / "metadata.yaml").is_file() or not path.is_dir():
+            return (path / "metadata.yaml").is_file()
+        entries = [entry for entry in path.iterdir() if not entry.name.startswith(".")]
+        return any(entry.suffix in _PARTS for entry in entries) and not any(entry.is_dir() for entry in entries)
 
     def video(self, path: Path) -> Video:
         bag = BagFile(path)

@@ -79,8 +79,7 @@ def detect_format(path: Path) -> str:
     """Detect the format of a file or folder, and return its name."""
     if not path.exists():
         raise InputError(f"recording folder or file does not exist: {path}")
-    names = _REGISTRY.known("format")
-    found = [name for name in names if _REGISTRY.find_class("format", name).detects(path)]  # type: ignore[attr-defined]
+    names, found = _REGISTRY.known("format"), _formats_of(path)
     if len(found) == 1:
         return found[0]
     if found:
@@ -95,6 +94,11 @@ def detect_format(path: Path) -> str:
         for name, parts in _PARTS.items():
             if any(fnmatch(entry, part) for entry in entries for part in parts):
                 return name
+    inside = [p.name for p in sorted(path.iterdir())[:_FEW] if _formats_of(p)] if path.is_dir() else []
+    if inside:
+        raise InputError(
+            f"{path} has no known format, but folders and files in it have", f"give {' or '.join(inside)}"
+        )
     cures = (cure for kinds, cure in _CONVERT.items() if path.is_file() and path.suffix.lower() in kinds.split())
     if cure := next(cures, None):
         raise InputError(f"{path} has no known format", cure)
@@ -105,6 +109,15 @@ def detect_format(path: Path) -> str:
         "each colour image needs a depth image that is aligned with it: record with an RGB-D camera",
         "in Python, mstfilter.Recording.from_arrays makes a recording from arrays",
     )
+
+
+_FEW = 20  # entries of a folder that are examined
+
+
+def _formats_of(path: Path) -> list[str]:
+    """Names of the formats that detect a path."""
+    names = _REGISTRY.known("format")
+    return [name for name in names if _REGISTRY.find_class("format", name).detects(path)]  # type: ignore[attr-defined]
 
 
 #: Suffixes of files that are not read, and how to convert them.

@@ -110,7 +110,7 @@ def compressed_depth(depth, floats, pack=png):
     """Data of the compressedDepth transport: 16UC1, or 32FC1 quantised in inverse depth."""
     if not floats:
         return struct.pack("<iff", 0, 0.0, 0.0) + pack(units(depth, 0.001))
-    a, b = 500.0, 0.9  # b is not 0 if the transport has a largest depth
+    a, b = 10100.0, -1009.0  # the transport's defaults: quantisation 100, largest depth 10 m
     return struct.pack("<iff", 0, a, b) + pack(np.rint(a / depth + b).astype(np.uint16))
 
 

@@ -170,3 +170,33 @@ def test_a_folder_without_metadata(tmp_path, kind):
     with pytest.raises(InputError, match=r"no metadata.yaml, and \d files of .db3 and .mcap") as caught:
         Bag().open(folder)
     assert "ros2 bag reindex" in caught.value.hints[0]
+
+
+def test_other_schemas_beside_those_of_ros_2(tmp_path):
+    """The profile is that of ROS 2, and one channel has JSON."""
+    from mcap.writer import Writer
+
+    store, path = Messages(False).store, tmp_path / "session.mcap"
+    with path.open("wb") as file:
+        writer, channels = Writer(file), {}
+        writer.start(profile="ros2")
+        other = writer.register_channel("/notes", "json", writer.register_schema("notes", "jsonschema", b"{}"))
+        writer.add_message(other, 1, b"{}", 1)
+        for topic, seconds, (name, message) in scene_messages(False, (0, 1)):
+            if topic not in channels:
+                text = store.generate_msgdef(name, ros_version=2)[0].encode()
+                channels[topic] = writer.register_channel(topic, "cdr", writer.register_schema(name, "ros2msg", text))
+            t = round(seconds * 1e9)
+            writer.add_message(channels[topic], t, bytes(store.serialize_cdr(message, name)), t)
+        writer.finish()
+    same_frames(Bag(pauses=Ends(), world=WORLD).open(path), (0, 1))
+
+
+def test_several_files_that_ros_2_has_not_written(tmp_path):
+    for name in "ab":
+        write_json(tmp_path / f"{name}.mcap", foxglove((0, 1)))
+    with pytest.raises(InputError, match="has 2 MCAP files that ROS 2 has not written") as caught:
+        open_recording(tmp_path)
+    assert "mcap merge" in caught.value.hints[0]
+    (tmp_path / "depth").mkdir()
+    assert not Bag.detects(tmp_path)

@@ -78,6 +78,14 @@ def test_files_that_are_not_read_name_the_tool_that_converts_them(tmp_path, name
     assert tool in caught.value.hints[0] and len(caught.value.hints) == 1
 
 
+def test_a_folder_of_recordings_is_told_which(tmp_path):
+    for name in ("000001", "000048"):
+        layouts.write_bop(tmp_path / "test" / name, (0,))
+    with pytest.raises(InputError, match="no known format, but folders and files in it have") as caught:
+        open_recording(tmp_path / "test")
+    assert caught.value.hints == ("give 000001 or 000048",)
+
+
 def test_depth_that_ffmpeg_took_from_an_azure_kinect(tmp_path):
     path = layouts.write_redwood(tmp_path / "frames", (0,))
     write_image(path / "depth" / "00000.png", np.full((576, 640), 700, np.uint16))
