@@ -307,7 +307,6 @@ LAYOUTS = {
         ("rgb.mp4", *_RGB),
         ("depth/*.png", "depth/*.npy"),
         _stray,
-        fps=60,
     ),
     "record3d": Layout(
         "Record3D (.r3d)",
@@ -327,7 +326,6 @@ LAYOUTS = {
         ("vga_wide/*.png", "lowres_wide/*.png"),
         ("lowres_depth/*.png",),
         _arkit,
-        fps=60,
     ),
     "bop": Layout(
         "BOP",
