@@ -85,6 +85,12 @@ def _read_bag(path: Path) -> None:
     _reader("bag", "pauses=every")(found[0] if found else path / "it.bag")
 
 
+def _read_bop(path: Path) -> None:
+    recording = open_recording(path, "layout", ["layout=bop", "pauses=every"])
+    recording.check()
+    recording.instance(1)
+
+
 def _write_run(path: Path) -> None:
     make_run(path, 2)
 
@@ -202,6 +208,8 @@ KINDS = {
     "checkpoint": Kind(_write_checkpoint, _read_checkpoint),
     "tum": Kind(_layout("tum"), _reader("tum", "K=131,131,79.5,59.5", "pauses=every")),
     "redwood": Kind(_layout("redwood"), _reader("redwood", "pauses=every")),
+    "stray": Kind(_layout("stray"), _reader("layout", "pauses=every")),
+    "bop": Kind(_layout("bop"), _read_bop),
     "bag": Kind(_bag("bag"), _read_bag),
     "mcap": Kind(_bag("mcap"), _read_bag),
 }

@@ -53,6 +53,8 @@ def data(tmp_path_factory):
         image = read_rgb(file) if file.parent.name == "rgb" else np.rint(read_depth(file, 1)).astype(np.uint16)
         write_image(file, image.repeat(4, axis=0).repeat(4, axis=1))
     layouts.write_redwood(path / "bedroom")
+    layouts.write_stray(path / "scan")
+    layouts.write_bop(path / "000048", (0, 4))
     (path / "frames").mkdir()
     for k in (0, 4):
         for part in ("rgb", "depth"):
@@ -119,7 +121,7 @@ def test_every_format_has_a_command():
     from mstfilter import formats
 
     data = {"recording": "table-7", "pairs": "frames", "tum": "rgbd_dataset"}
-    data |= {"redwood": "bedroom", "bag": "session.bag"}
+    data |= {"redwood": "bedroom", "bag": "session.bag", "layout": "scan"}
     assert set(data) == set(formats.__components__["format"])
     assert all(any(name in command.split() for command in COMMANDS) for name in data.values())
 

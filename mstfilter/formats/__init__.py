@@ -12,9 +12,12 @@ write one more of them. A long video is divided into clips at its pauses, which 
 `sources`                  `open_recording`: finds out the format of a path and opens it
 `folder`                   the recording folder of mstfilter: reader and writer
 `pairs`, `tum`, `redwood`  folders of images: pairs of colour and depth, TUM RGB-D, Redwood and Open3D
-`bag`                      ROS 1 and ROS 2 bags, MCAP
+`known_layout`, `layouts`  folders of phones and data sets: their reader, and what they look like
+`bag`, `mcap_files`        ROS 1 and ROS 2 bags, MCAP; messages of Foxglove
 `video`, `image_folders`   what all readers of videos share; what those of image folders share
 `images`, `ros_images`     decoding of image files, and of images in ROS messages
+`rvl`, `record3d`          decoding of compressed depth
+`movies`, `reprojection`   frames of a video file; images brought into one camera
 `pauses`                   rules that find the pauses
 =========================  ============================================================================
 """
@@ -31,6 +34,7 @@ __components__ = {
         "tum": "Tum",
         "redwood": "Redwood",
         "bag": "Bag",
+        "layout": "KnownLayout",
     },
     "pauses": {"still": "Still", "settled": "Settled", "at": "At", "ends": "Ends", "every": "EveryNth"},
 }

@@ -10,6 +10,7 @@ from mstfilter.formats.images import (
     read_rgb as read_rgb,
     write_image as write_image,
 )
+from mstfilter.formats.known_layout import KnownLayout as KnownLayout
 from mstfilter.formats.pairs import PairedImages as PairedImages
 from mstfilter.formats.pauses import At as At, Ends as Ends, EveryNth as EveryNth, Settled as Settled, Still as Still
 from mstfilter.formats.redwood import Redwood as Redwood

@@ -1,16 +1,17 @@
-"""Reads ROS 1 bags, ROS 2 bags and MCAP files with colour, depth and CameraInfo topics.
+"""Reads ROS 1 bags, ROS 2 bags and MCAP files with colour, depth and calibration topics.
 
 >>> Bag(colour="/camera/color/image_raw", depth="/camera/aligned_depth_to_color/image_raw").open(Path("session.bag"))
 
 The parameters `colour` and `depth` are needed only if several topics are suitable. The camera matrix is K (P for
-rectified images) in the ``camera_info`` topic that belongs to the colour topic. A frame consists of a colour and a
+rectified images) in the ``camera_info`` topic that belongs to the colour topic, or in the only calibration topic with
+the frame of the colour images. A frame consists of a colour and a
 depth image whose header time stamps are mutually nearest and differ by at most `tolerance_s` seconds. If a message
 has no stamp, all messages have the times of the log. Depth must be registered to colour, and both images must have
 the same size and ``frame_id``. Transforms (tf) are not read. The camera is assumed not to move, and its pose is
 computed from the table.
 
 `mstfilter.formats.ros_images` describes the encodings. The library rosbags (extra ``bags``) reads the files without
-ROS.
+ROS, and `mstfilter.formats.mcap_files` reads MCAP files that ROS 2 has not written.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import contextlib
 import re
 import weakref
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ import numpy as np
 from mstfilter.base.errors import InputError, missing_library, warn_user
 from mstfilter.base.files import reading
 from mstfilter.base.reading import MAX_TEXT, open_regular
+from mstfilter.formats.mcap_files import McapMessages, is_foreign
 from mstfilter.formats.ros_images import DEPTH, GREY, colour_image, depth_image, image_encoding
 from mstfilter.formats.video import Video, VideoFormat, pair_stamps
 
@@ -62,16 +64,27 @@ class BagFile:
         self.path = path
         if not path.exists():
             raise InputError(f"bag does not exist: {path}")
+        files = [path] if path.is_file() or (path / "metadata.yaml").is_file() else _parts(path)
         for file in sorted(file for file in path.iterdir() if not file.is_dir()) if path.is_dir() else [path]:
             limit = MAX_TEXT if file.suffix == ".yaml" else 2**63
             with reading(file, "a bag"), open_regular(file, limit) as opened:
                 if file.suffix == ".bag" and opened.read(13) != b"#ROSBAG V2.0\n":
                     raise InputError(f"bag cannot be read: {file} does not begin with #ROSBAG V2.0")
         with self._reading():
-            self._reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
-            self._reader.open()
+            store = get_typestore(Stores.LATEST)
+            if any(map(is_foreign, files)) and len(files) > 1:
+                text = f"{path} has {len(files)} MCAP files that ROS 2 has not written"
+                raise InputError(text, "give one of them, or join them: mcap merge *.mcap --output-file joined.mcap")
+            foreign = is_foreign(files[0])
+            self._reader: Any = McapMessages(files[0]) if foreign else AnyReader(files, default_typestore=store)
+            try:
+                self._reader.open()
+            except KeyError:  # rosbags meets a schema of another kind beside those of ROS 2
+                if files[0].suffix != ".mcap" or len(files) > 1:
+                    raise
+                self._reader = McapMessages(files[0])
+                self._reader.open()
         weakref.finalize(self, _close, self._reader)
-        self.is_ros2: bool = self._reader.is2
 
     def topics(self, *kinds: str) -> dict[str, int]:
         """Number of messages of each topic with a message type in `kinds`. Topics without messages are omitted."""
@@ -122,11 +135,22 @@ class BagFile:
         raise InputError(f"bag {self.path} changed while it was read: a message of {topic} is missing")
 
 
+def _parts(path: Path) -> list[Path]:
+    """The files of a ROS 2 bag without its metadata.yaml."""
+    files = [file for ending in _PARTS for file in sorted(path.glob(f"*{ending}"))]
+    kinds = {file.suffix for file in files}
+    if len(kinds) != 1:
+        text = f"{path} has no metadata.yaml, and {len(files)} files of {' and '.join(sorted(kinds)) or 'a bag'}"
+        raise InputError(text, "write the file again: ros2 bag reindex; or give one of the files")
+    return files
+
+
 def _close(reader: Any) -> None:
     with contextlib.suppress(Exception):
         reader.close()
 
 
+_PARTS = (".mcap", ".db3")
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _INFO = "sensor_msgs/msg/CameraInfo"
 _REGISTERED = "record the aligned depth; or, if it is registered: registered=true"
@@ -206,14 +230,19 @@ class Bag(VideoFormat):
     @classmethod
     def detects(cls, path: Path) -> bool:
         if path.is_file():
-            return path.suffix in (".bag", ".mcap", ".db3")
-        return (path / "metadata.yaml").is_file()
+            return path.suffix in (".bag", *_PARTS)
+        if (path / "metadata.yaml").is_file() or not path.is_dir():
+            return (path / "metadata.yaml").is_file()
+        entries = [entry for entry in path.iterdir() if not entry.name.startswith(".")]
+        return any(entry.suffix in _PARTS for entry in entries) and not any(entry.is_dir() for entry in entries)
 
     def video(self, path: Path) -> Video:
         bag = BagFile(path)
         kinds = ((_IMAGE, False), (_COMPRESSED, True))
         streams = [_stream(bag, name, n, packed) for kind, packed in kinds for name, n in bag.topics(kind).items()]
         pictures = [s for s in streams if s.encoding not in DEPTH]
+        if not pictures and any(s.encoding != "mono16" for s in streams):
+            pictures = [s for s in streams if s.encoding == "mono16"]  # grey, since the depth is another one
         # Grey images may be those of an infrared camera.
         pictures = [s for s in pictures if s.encoding not in GREY] or pictures
         colour = _choose(path, "colour", self.colour, pictures, streams)
@@ -260,7 +289,7 @@ class Bag(VideoFormat):
         return logged if any(missing) else listed
 
     def _depth(self, path: Path, colour: _Stream, streams: list[_Stream]) -> _Stream:
-        found = [s for s in streams if s.encoding in DEPTH]
+        found = [s for s in streams if s.encoding in DEPTH and s != colour]
         fitting = [s for s in found if s.size == colour.size and (self.registered or s.frame_id == colour.frame_id)]
         depth = _choose(path, "depth", self.depth, fitting if fitting and not self.depth else found, streams)
         if depth.recorded_raw and not (self.registered and depth.size == colour.size):
@@ -279,17 +308,18 @@ class Bag(VideoFormat):
         self, bag: BagFile, colour: _Stream, depth: _Stream
     ) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """fx, fy, cx, cy and the distortion of the colour image."""
-        infos, name = bag.topics(_INFO), colour.info
+        infos = bag.topics(_INFO)
+        name = colour.info if colour.info in infos else _info_by_frame(bag, infos, colour) or colour.info
 
-        def stored(stream: _Stream) -> _Info | None:
+        def stored(stream: _Stream, topic: str) -> _Info | None:
             try:
-                return _camera_info(bag, stream.info, stream.rectified) if stream.info in infos else None
+                return _camera_info(bag, topic, stream.rectified) if topic in infos else None
             except InputError:
                 if self.K:
                     return None
                 raise
 
-        own = stored(colour)
+        own = stored(colour, name)
         if own is None:
             if self.K:
                 return self.K, self.distortion
@@ -303,11 +333,22 @@ class Bag(VideoFormat):
                 f"{bag.path}: {name} is of images of {size[0]} x {size[1]}, {colour} is not",
                 "give the matrix of these images: K=fx,fy,cx,cy",
             )
-        other = None if self.registered or depth.info == name else stored(depth)
+        other = None if self.registered or depth.info == name else stored(depth, depth.info)
         if other is not None and other[2][0] and not np.allclose(other[0], matrix, atol=1.0):
             text = f"{bag.path}: camera matrices of {name} and {depth.info} differ: depth is not registered to colour"
             raise InputError(text, _REGISTERED)
         return self.K or (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]), self.distortion or distortion
+
+
+def _info_by_frame(bag: BagFile, infos: Iterable[str], colour: _Stream) -> str | None:
+    """The only calibration topic whose messages have the frame and the size of the colour images."""
+    found = []
+    for name in infos:
+        message = bag.first(name)
+        size = int(message.width), int(message.height)
+        if str(message.header.frame_id).lstrip("/") == colour.frame_id and size in ((0, 0), colour.size):
+            found.append(name)
+    return found[0] if len(found) == 1 else None
 
 
 def _check_order(path: Path, topic: str, entries: list[Entry]) -> None:
@@ -359,7 +400,7 @@ def _choose(path: Path, what: str, name: str, candidates: list[_Stream], streams
         chosen = next((s for s in streams if s.name == name), None)
         if chosen is None:
             raise InputError(f"{path}: no image topic {name!r} for {what}", "image topics are:", *listed)
-        if (chosen.encoding in DEPTH) != (what == "depth"):
+        if chosen.encoding != "mono16" and (chosen.encoding in DEPTH) != (what == "depth"):
             raise InputError(f"{path}: {chosen} has no {what} images", "image topics are:", *listed)
         return chosen
     if not candidates:
@@ -379,7 +420,8 @@ _Info = tuple[np.ndarray, tuple[float, ...], tuple[int, int]]
 def _camera_info(bag: BagFile, name: str, rectified: bool) -> _Info:
     """Camera matrix (3, 3), distortion, and width and height of the images."""
     message = bag.first(name)
-    D, K, P = (message.d, message.k, message.p) if bag.is_ros2 else (message.D, message.K, message.P)
+    lower = hasattr(message, "k")  # of ROS 2; ROS 1 and Foxglove have capitals
+    D, K, P = (message.d, message.k, message.p) if lower else (message.D, message.K, message.P)
     raw, projection = np.reshape(np.asarray(K, float), (3, 3)), np.reshape(np.asarray(P, float), (3, 4))[:, :3]
     if raw[0, 0] <= 0:
         raise InputError(

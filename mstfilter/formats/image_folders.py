@@ -21,6 +21,7 @@ import numpy as np
 from mstfilter.base.errors import InputError, check_number, warn_user
 from mstfilter.base.files import reading
 from mstfilter.base.reading import MAX_TEXT, read_bytes, read_json
+from mstfilter.formats.images import File
 from mstfilter.formats.video import Video, VideoFormat, warn_of_unread
 
 INTRINSICS = ("intrinsic.json", "camera_intrinsic.json", "intrinsics.json", "camera.json")
@@ -73,9 +74,11 @@ class Intrinsics:
         names = ("fx", "fy", "cx", "cy")
         with reading(self.file, "a file of intrinsics", hint):
             if "intrinsic_matrix" in self.entries:
-                K = _four(np.reshape(self.entries["intrinsic_matrix"], (3, 3)).T)
+                K = four_intrinsics(np.reshape(self.entries["intrinsic_matrix"], (3, 3)).T)
             else:
-                K = _four([self.entries[name] for name in names] if "fx" in self.entries else self.entries["K"])
+                K = four_intrinsics(
+                    [self.entries[name] for name in names] if "fx" in self.entries else self.entries["K"]
+                )
         for name, value in zip(names, K, strict=True):
             check_number(f"{self.file}: {name}", value, hint, above=0)
         return K
@@ -106,7 +109,7 @@ class Intrinsics:
         return video
 
 
-def _four(K: Any) -> tuple[float, ...]:
+def four_intrinsics(K: Any) -> tuple[float, ...]:
     """Intrinsics fx, fy, cx, cy from four numbers, or from the nine numbers of a 3 x 3 matrix."""
     values = np.asarray(K, dtype=float)
     if values.size == 4:
@@ -152,12 +155,18 @@ def check_aligned(path: Path, used: Collection[str], hint: str) -> None:
         raise InputError(text, hint.format(name=aligned[0]), f"or, if they are no depth images: rename {aligned[0]}/")
 
 
-def numbers_in(file: Path) -> list[Decimal]:
-    """The numbers in a file name."""
-    return [Decimal(number) for number in re.findall(r"\d+(?:\.\d+)?", file.stem)]
+_SCAN = re.compile(r"(\d+)-(\d{12})")  # names of Redwood's object scans: number of the frame, and microseconds
 
 
-def number_of(file: Path) -> Decimal:
+def numbers_in(file: File) -> list[Decimal]:
+    """The numbers in a file name. The time in the name of an object scan is in seconds, with decimals."""
+    stem = file.name.rpartition(".")[0]
+    if scan := _SCAN.fullmatch(stem):
+        return [Decimal(scan[1]), Decimal(scan[2]).scaleb(-6)]
+    return [Decimal(number) for number in re.findall(r"\d+(?:\.\d+)?", stem)]
+
+
+def number_of(file: File) -> Decimal:
     """The last number in a file name, or -1 for a name without numbers."""
     return (numbers_in(file) or [Decimal(-1)])[-1]
 

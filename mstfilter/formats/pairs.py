@@ -15,15 +15,19 @@ import numpy as np
 from mstfilter.base.errors import InputError, check_number
 from mstfilter.base.fields import NonNegativeFloat
 from mstfilter.formats.image_folders import Intrinsics
-from mstfilter.formats.images import read_optional
+from mstfilter.formats.images import COLOUR_SUFFIXES, DEPTH_SUFFIXES, read_optional
 from mstfilter.formats.pauses import EveryNth
 from mstfilter.formats.video import Video, VideoFormat, object_numbers
 from mstfilter.scene import TABLE_TOLERANCE, Frame, PauseRule, Recording, table_residual
+
+_SUFFIXES = {*COLOUR_SUFFIXES, *DEPTH_SUFFIXES}
 
 
 @dataclass(frozen=True)
 class PairedImages(VideoFormat):
     """A folder of pairs NAME_rgb.png, NAME_depth.png with an info.json. By default, every frame is a pause.
+
+    Other suffixes are those of `Redwood`, such as NAME_rgb.jpg and NAME_depth.npy.
 
     ``info.json`` holds ``K`` (fx, fy, cx, cy, or a 3x3 matrix) and ``depth_scale_m``, metres per unit of the 16-bit
     depth images. Label images NAME_label.png (8 or 16 bits, one number for each object) are used as the true label
@@ -46,18 +50,21 @@ class PairedImages(VideoFormat):
 
     @classmethod
     def detects(cls, path: Path) -> bool:
-        return (path / "info.json").is_file() and any(path.glob("*_rgb.png"))
+        pictures = (path.glob(f"*_rgb{end}") for end in COLOUR_SUFFIXES)
+        return (path / "info.json").is_file() and any(any(found) for found in pictures)
 
     def video(self, path: Path) -> Video:
         calibration = Intrinsics.read(path, ("info.json",), "depth_scale_m")
         scale: Any = self.depth_scale or calibration.entries.get("depth_scale_m")
         hint = 'for example {"K": [525, 525, 319.5, 239.5], "depth_scale_m": 0.001}'
         check_number(f"{path / 'info.json'}: depth_scale_m", scale, hint, above=0)
-        names = {p.name.removesuffix(end) for end in ("_rgb.png", "_depth.png") for p in path.glob(f"*{end}")}
+        found = {p.stem: p for end in _SUFFIXES for part in ("rgb", "depth") for p in path.glob(f"*_{part}{end}")}
+        names = {stem.rpartition("_")[0] for stem in found}
         key = lambda name: [w.zfill(20) if w.isdigit() else w for w in re.split(r"(\d+)", name)]  # noqa: E731
         present = sorted(sorted(names), key=key)
         chosen = [str(name) for name in self.frames] or present or ["NAME"]
-        files = [tuple(path / f"{name}_{part}.png" for part in ("rgb", "depth", "robot")) for name in chosen]
+        stems = [[f"{name}_{part}" for part in ("rgb", "depth", "robot")] for name in chosen]
+        files = [tuple(found.get(stem, path / f"{stem}.png") for stem in listed) for listed in stems]
         for name, pair in zip(chosen, files, strict=True):
             if lost := [file.name for file in pair[:2] if not file.is_file()]:
                 hint = (

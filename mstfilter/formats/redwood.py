@@ -27,11 +27,12 @@ from mstfilter.formats.image_folders import (
     numbers_in,
     seconds_in,
 )
+from mstfilter.formats.images import COLOUR_SUFFIXES, DEPTH_SUFFIXES
+from mstfilter.formats.known_layout import KnownLayout
 from mstfilter.formats.video import Video, VideoFormat, pair_stamps
 from mstfilter.scene import Frame
 
-_COLOUR, _SUFFIXES = ("color", "image", "rgb", "colour"), (".png", ".jpg", ".jpeg")
-_DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
+_COLOUR = "color", "image", "rgb", "colour"
 _POLL_S = 0.02
 _WRITTEN_S = 0.3  # age of the last files after which they are complete
 _PARTNER_S = 2.0  # how long a pair waits for its second image, or to become readable
@@ -44,9 +45,9 @@ class Redwood(VideoFormat):
     Intrinsics are read from a file in the same folder, or given as ``K``. ``intrinsics.json`` or ``camera.json``
     holds ``fx``, ``fy``, ``cx``, ``cy``, or ``K`` (3 x 3), or the entries of pyrealsense2. ``intrinsic.json`` or
     ``camera_intrinsic.json`` holds Open3D's ``intrinsic_matrix`` in column-major order. Colour and depth images are
-    paired by the last number in their names, or by time if the numbers are time stamps. Depth files are 16-bit PNG or
-    TIFF, or floating-point in metres (.npy, .tif). An optional robot mask robot/NAME.png has the name of its colour
-    image. The camera must not move. Format: http://redwood-data.org/indoor/fileformat.html.
+    paired by the last number in their names, or by time if the numbers are time stamps. Depth files are 16-bit PNG,
+    TIFF or PGM, arrays (.npy, .npz), or floating-point in metres (also .tif, .exr). An optional robot mask
+    robot/NAME.png has the name of its colour image. The camera must not move. Format: http://redwood-data.org/indoor/fileformat.html.
 
     Further parameters: `VideoFormat`.
 
@@ -63,7 +64,7 @@ class Redwood(VideoFormat):
 
     @classmethod
     def detects(cls, path: Path) -> bool:
-        if not (path / "depth").is_dir() or is_recording(path) or (path / "scene_camera.json").is_file():
+        if not (path / "depth").is_dir() or is_recording(path) or KnownLayout.detects(path):
             return False
         folders = tuple(name for name in _COLOUR if name != "rgb" or not (path / "rgb.txt").is_file())
         return any((path / name).is_dir() for name in folders)
@@ -117,7 +118,7 @@ class Redwood(VideoFormat):
         folder = next((path / name for name in _COLOUR if (path / name).is_dir()), path / _COLOUR[0])
         if not known:
             check_aligned(path, {"depth"}, "rename depth/ to raw/, and {name}/ to depth/")
-        return _images(folder, _SUFFIXES, known), _images(path / "depth", _DEPTH_SUFFIXES, known)
+        return _images(folder, COLOUR_SUFFIXES, known), _images(path / "depth", DEPTH_SUFFIXES, known)
 
     def _rate(self, calibration: Intrinsics) -> float:
         """Frame rate in frames per second."""

@@ -79,8 +79,7 @@ def detect_format(path: Path) -> str:
     """Detect the format of a file or folder, and return its name."""
     if not path.exists():
         raise InputError(f"recording folder or file does not exist: {path}")
-    names = _REGISTRY.known("format")
-    found = [name for name in names if _REGISTRY.find_class("format", name).detects(path)]  # type: ignore[attr-defined]
+    names, found = _REGISTRY.known("format"), _formats_of(path)
     if len(found) == 1:
         return found[0]
     if found:
@@ -95,6 +94,14 @@ def detect_format(path: Path) -> str:
         for name, parts in _PARTS.items():
             if any(fnmatch(entry, part) for entry in entries for part in parts):
                 return name
+    inside = [p.name for p in sorted(path.iterdir())[:_FEW] if _formats_of(p)] if path.is_dir() else []
+    if inside:
+        raise InputError(
+            f"{path} has no known format, but folders and files in it have", f"give {' or '.join(inside)}"
+        )
+    cures = (cure for kinds, cure in _CONVERT.items() if path.is_file() and path.suffix.lower() in kinds.split())
+    if cure := next(cures, None):
+        raise InputError(f"{path} has no known format", cure)
     raise InputError(
         f"{path} has no known format",
         *near,
@@ -104,6 +111,28 @@ def detect_format(path: Path) -> str:
     )
 
 
+_FEW = 20  # entries of a folder that are examined
+
+
+def _formats_of(path: Path) -> list[str]:
+    """Names of the formats that detect a path."""
+    names = _REGISTRY.known("format")
+    return [name for name in names if _REGISTRY.find_class("format", name).detects(path)]  # type: ignore[attr-defined]
+
+
+#: Suffixes of files that are not read, and how to convert them.
+_CONVERT = {
+    ".mkv": "Azure Kinect: python azure_kinect_mkv_reader.py --input FILE.mkv --output frames (an example of Open3D, "
+    "which aligns depth to colour), then convert frames/; images that ffmpeg extracts are not aligned",
+    ".sens": "extract the frames: reader.py --filename FILE.sens --output_path frames --export_color_images "
+    "--export_depth_images --export_poses --export_intrinsics (SensReader of ScanNet), then convert frames/",
+    ".svo .svo2": "ZED: write left images and depth with its SDK as numbered images, 16-bit PNG, to rgb/ and depth/",
+    ".oni": "OpenNI: play it with depth registered to colour, and write numbered images to rgb/ and depth/",
+    ".mp4 .mov": "a video of colour has no depth: give the folder that also has the depth images",
+    ".h5 .hdf5 .npz": "read its arrays, and make a recording: mstfilter.Recording.from_arrays(rgb, depth, K)",
+    ".ply .pcd": "a cloud of points has no images: record colour and depth images",
+    ".zip": "unpack it, and give the folder",
+}
 _PARTS = {
     "pairs": ("info.json", "*_rgb.png", "*_depth.png"),
     "tum": ("rgb.txt", "depth.txt"),

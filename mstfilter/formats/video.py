@@ -254,6 +254,10 @@ def warn_of_unread(file: Path, stored: Iterable[str], read: Iterable[str], notes
         warn_user(f"{file}: not read: {', '.join(unread)}", f"the entries that are read are {', '.join(read)}")
 
 
+_AZURE_SIZES = ((640, 576), (320, 288), (512, 512), (1024, 1024))  # of the depth camera of an Azure Kinect
+_AZURE = "if ffmpeg took them from the .mkv of an Azure Kinect: Open3D's azure_kinect_mkv_reader.py aligns them"
+
+
 def check_images(rgb: np.ndarray, depth: np.ndarray, camera: Camera, scale: float, where: str) -> None:
     """Raise InputError unless colour and depth have the size of the camera, and depth is plausible in metres."""
     sizes = [f"{image.shape[1]} x {image.shape[0]}" for image in (rgb, depth)]
@@ -261,6 +265,7 @@ def check_images(rgb: np.ndarray, depth: np.ndarray, camera: Camera, scale: floa
         raise InputError(
             f"{where} has depth of {sizes[1]}, colour of {sizes[0]}: depth is not registered to colour",
             "align depth to colour when recording (each depth pixel must belong to the colour pixel above it)",
+            *([_AZURE] if depth.shape[::-1] in _AZURE_SIZES else []),
         )
     if rgb.shape[:2] != (camera.height, camera.width):
         raise InputError(f"{where} is {sizes[0]}, the camera has {camera.width} x {camera.height}")

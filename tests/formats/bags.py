@@ -80,12 +80,38 @@ def png(pixels):
     return cv2.imencode(".png", pixels)[1].tobytes()
 
 
-def compressed_depth(depth, floats):
+def rvl(pixels):
+    """Width, height and RVL stream of an image, written bit by bit as Wilson (2017) describes it."""
+    bits, last, k, flat = [], 0, 0, pixels.ravel().tolist()
+
+    def number(value):
+        while True:
+            value, part = value >> 3, value & 7
+            bits.append(f"{part + 8 * (value > 0):04b}")
+            if not value:
+                return
+
+    while k < len(flat):
+        for reading in (False, True):
+            begin = k
+            while k < len(flat) and (flat[k] > 0) == reading:
+                k += 1
+            number(k - begin)
+        for value in flat[begin:k]:
+            number(2 * (value - last) if value >= last else 2 * (last - value) - 1)
+            last = value
+    text = "".join(bits)
+    text += "0" * (-len(text) % 32)
+    words = [int(text[i : i + 32], 2) for i in range(0, len(text), 32)]
+    return struct.pack(f"<II{len(words)}I", *pixels.shape[::-1], *words)
+
+
+def compressed_depth(depth, floats, pack=png):
     """Data of the compressedDepth transport: 16UC1, or 32FC1 quantised in inverse depth."""
     if not floats:
-        return struct.pack("<iff", 0, 0.0, 0.0) + png(units(depth, 0.001))
-    a, b = 500.0, 0.0
-    return struct.pack("<iff", 0, a, b) + png(np.rint(a / depth + b).astype(np.uint16))
+        return struct.pack("<iff", 0, 0.0, 0.0) + pack(units(depth, 0.001))
+    a, b = 10100.0, -1009.0  # the transport's defaults: quantisation 100, largest depth 10 m
+    return struct.pack("<iff", 0, a, b) + pack(np.rint(a / depth + b).astype(np.uint16))
 
 
 def write(path, kind, messages):
@@ -135,7 +161,8 @@ def scene_messages(
         elif depth == "32FC1":
             found.append((depth_topic, t + lag, make.image(t + lag, metres[k].astype(np.float32), depth, **more)))
         elif depth is not None:
-            data = compressed_depth(metres[k], depth == "compressed 32FC1")
-            form = f"{'32FC1' if depth == 'compressed 32FC1' else '16UC1'}; compressedDepth png"
+            code = "rvl" if "rvl" in depth else "png"
+            data = compressed_depth(metres[k], "32FC1" in depth, rvl if code == "rvl" else png)
+            form = f"{'32FC1' if '32FC1' in depth else '16UC1'}; compressedDepth {code}"
             found.append((depth_topic + "/compressedDepth", t + lag, make.compressed(t + lag, data, form)))
     return found

@@ -16,6 +16,7 @@ from mstfilter.formats.bag import Bag
 from mstfilter.formats.folder import save_recording
 from mstfilter.formats.pauses import Ends
 from mstfilter.formats.ros_images import colour_image, depth_image
+from mstfilter.formats.rvl import decode_rvl
 from tests.formats.bags import COLOUR, DEPTH, KINDS, Messages, png, scene_messages, topic_info, write
 from tests.formats.layouts import FPS, PAUSES, SHIFTS, K, units, video
 from tests.formats.test_layouts import WORLD, same_frames
@@ -38,13 +39,20 @@ def test_every_kind_of_bag(tmp_path, kind):
 
 @pytest.mark.parametrize(
     ("depth", "colour"),
-    [("32FC1", "bgr8"), ("mono16", "compressed"), ("compressed 16UC1", "bgr8"), ("compressed 32FC1", "compressed")],
+    [
+        ("32FC1", "bgr8"),
+        ("mono16", "compressed"),
+        ("compressed 16UC1", "bgr8"),
+        ("compressed 32FC1", "compressed"),
+        ("compressed rvl 16UC1", "bgr8"),
+        ("compressed rvl 32FC1", "bgr8"),
+    ],
 )
 def test_encodings(tmp_path, depth, colour):
     path = write(tmp_path / "s", "db3", scene_messages(False, (0, 3), depth=depth, colour=colour))
     recording = Bag(pauses=Ends(), world=WORLD).open(path)
-    # 32FC1 is compressed in steps of 1 / 500 of the inverse depth: below z^2 / 1000 m.
-    atol = 2e-3 if depth == "compressed 32FC1" else 2e-7
+    # 32FC1 is compressed in steps of 1 / 10100 of the inverse depth: rounded by less than z^2 / 20200 m.
+    atol = 5e-4 if depth.endswith("32FC1") and "compressed" in depth else 2e-7
     same_frames(recording, (0, 3), atol)
 
 
@@ -75,6 +83,71 @@ def test_pixels_of_other_encodings():
     for wrong in (message, make.image(0, millimetres, "bayer_rggb8")[1]):
         with pytest.raises(InputError, match="bytes|encoding"):
             depth_image(wrong, False, 0.001, "m")
+
+
+def test_rvl_of_another_encoder():
+    """The stream that the library rvl 1.0.4 writes; damaged streams are refused."""
+    stream, pixels = bytes.fromhex("23d28f230193a8120050fe19"), [[0, 0, 700, 701, 699], [0, 1500, 1500, 0, 65535]]
+    np.testing.assert_array_equal(decode_rvl(stream, 5, 2, "m"), pixels)
+    for width, height, data in (
+        (5, 3, stream),
+        (5, 2, stream[:4]),
+        (5, 2, b""),
+        (0, 2, stream),
+        (2**20, 2**20, stream),
+    ):
+        with pytest.raises(InputError, match="m is damaged: RVL"):
+            decode_rvl(data, width, height, "m")
+    with pytest.raises(InputError, match="too few for RVL"):
+        depth_image(Messages(False).compressed(0, b"0" * 15, "16UC1; compressedDepth rvl")[1], True, 0.001, "m")
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_colour_of_bayer_sensors_and_of_16_bits(bits):
+    """Three areas of one colour each: the mosaic has the named colours in the first two rows and columns."""
+    make, kind = Messages(False), np.uint8 if bits == 8 else np.uint16
+    rgb = np.repeat(np.array([[[200, 20, 40], [30, 180, 60], [10, 50, 220]]], np.uint8), 8, axis=1).repeat(12, axis=0)
+    wide = rgb.astype(kind) * (1 if bits == 8 else 257)
+    inside = np.arange(24) % 8 % 7 > 1  # not at a border of two colours
+    for pattern in ("rggb", "bggr", "gbrg", "grbg"):
+        mosaic = np.zeros(wide.shape[:2], kind)
+        for k, letter in enumerate(pattern):
+            mosaic[k // 2 :: 2, k % 2 :: 2] = wide[k // 2 :: 2, k % 2 :: 2, "rgb".index(letter)]
+        found = colour_image(make.image(0, mosaic, f"bayer_{pattern}{bits}")[1], False, "m")
+        np.testing.assert_allclose(found[2:-2, inside].astype(int), rgb[2:-2, inside], atol=1)
+    if bits == 16:
+        four = np.dstack([wide, wide[..., 0]])
+        images = {"rgb16": wide, "bgr16": wide[..., ::-1], "rgba16": four, "bgra16": four[..., [2, 1, 0, 3]]}
+        for encoding, pixels in images.items():
+            found = colour_image(make.image(0, pixels, encoding)[1], False, "m")
+            np.testing.assert_array_equal(found, rgb)
+
+
+@pytest.mark.parametrize("order", [("nv12", 1), ("nv21", -1)])
+def test_colour_with_half_the_resolution_of_chroma(order):
+    """Full-range JPEG numbers do not apply: brightness 16 to 235, chroma 128 +- 112 (BT.601)."""
+    encoding, step = order
+    y, u, v = 81, 90, 240  # red
+    planes = np.full((6, 8), y, np.uint8), np.tile(np.array([u, v][::step], np.uint8), (3, 4))
+    _, message = Messages(False).image(0, np.vstack(planes), encoding)
+    message.height = 6
+    np.testing.assert_allclose(colour_image(message, False, "m").astype(int), np.full((6, 8, 3), (255, 0, 0)), atol=2)
+
+
+def test_a_grey_image_of_16_bits_is_colour_if_there_is_other_depth(tmp_path):
+    """Without a name, and by its name beside a colour image."""
+    messages = scene_messages(False, (0, 1), colour=None)
+    make, rgb = Messages(False), video((0, 1))[0]
+    for k in range(2):
+        t = START + k / FPS
+        messages.append((COLOUR, t, make.image(t, rgb[k][..., 1].astype(np.uint16) * 257, "mono16")))
+    recording = Bag(pauses=Ends(), world=WORLD).open(write(tmp_path / "one", "db3", messages))
+    np.testing.assert_array_equal(recording.frames[1].rgb, np.repeat(rgb[1][..., 1:2], 3, axis=2))
+    other = "/other/image_raw"
+    messages += [(other, START + k / FPS, make.image(START + k / FPS, rgb[k], "rgb8")) for k in range(2)]
+    path = write(tmp_path / "two", "db3", messages)
+    named = Bag(colour=COLOUR, depth=DEPTH, pauses=Ends(), world=WORLD).open(path)
+    np.testing.assert_array_equal(named.frames[1].rgb, recording.frames[1].rgb)
 
 
 def test_registered_depth_is_the_default(tmp_path):

@@ -35,18 +35,17 @@ def write_pairs(path, names=("a", "b")):
 
 @pytest.mark.parametrize("name", WRITERS)
 def test_formats_are_detected(tmp_path, name):
-    """Each by exactly one reader; every registered format has a test here or among the bags and pairs."""
+    """Each by exactly one reader; every registered format has a test here or among the bags, pairs and layouts."""
     path = WRITERS[name](tmp_path / "data")
     assert detect_format(path) == name
-    assert set(REGISTRY.known("format")) == {*WRITERS, "bag", "pairs"}
+    assert set(REGISTRY.known("format")) == {*WRITERS, "bag", "pairs", "layout"}
 
 
 def test_unknown_and_ambiguous(tmp_path):
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "a.txt").write_text("x")
     (tmp_path / "data.bin").write_bytes(b"x")
-    (tmp_path / "video.mp4").write_bytes(b"")
-    for name in ("notes", "data.bin", "video.mp4"):
+    for name in ("notes", "data.bin"):
         with pytest.raises(InputError, match="has no known format") as caught:
             open_recording(tmp_path / name)
         assert "tum, redwood, bag" in caught.value.hints[0]
@@ -61,6 +60,38 @@ def test_unknown_and_ambiguous(tmp_path):
         open_recording(path, "tom")
     with pytest.raises(InputError, match="does not exist"):
         open_recording(tmp_path / "none")
+
+
+@pytest.mark.parametrize(
+    ("name", "tool"),
+    [
+        ("a.mkv", "azure_kinect_mkv_reader.py"),
+        ("a.sens", "SensReader"),
+        ("a.svo2", "its SDK"),
+        ("a.mp4", "folder"),
+    ],
+)
+def test_files_that_are_not_read_name_the_tool_that_converts_them(tmp_path, name, tool):
+    (tmp_path / name).write_bytes(b"x")
+    with pytest.raises(InputError, match="has no known format") as caught:
+        open_recording(tmp_path / name)
+    assert tool in caught.value.hints[0] and len(caught.value.hints) == 1
+
+
+def test_a_folder_of_recordings_is_told_which(tmp_path):
+    for name in ("000001", "000048"):
+        layouts.write_bop(tmp_path / "test" / name, (0,))
+    with pytest.raises(InputError, match="no known format, but folders and files in it have") as caught:
+        open_recording(tmp_path / "test")
+    assert caught.value.hints == ("give 000001 or 000048",)
+
+
+def test_depth_that_ffmpeg_took_from_an_azure_kinect(tmp_path):
+    path = layouts.write_redwood(tmp_path / "frames", (0,))
+    write_image(path / "depth" / "00000.png", np.full((576, 640), 700, np.uint16))
+    with pytest.raises(InputError, match="depth of 640 x 576, colour of 160 x 120") as caught:
+        open_recording(path)
+    assert "azure_kinect_mkv_reader.py" in caught.value.hints[-1]
 
 
 def test_options_as_text():
