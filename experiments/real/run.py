@@ -104,7 +104,13 @@ def run(
             ]
             mean = {key: round(float(np.mean([row[key] for row in rows])), 4) for key in rows[0]}
             least = {"least_found": min(row["found"] for row in rows)}
-            losses = log_losses(Belief.of_step(states[name], info), clip.after.camera, truth.labels)
+            belief = Belief.of_step(states[name], info)
+            answers = {"quality_answer": belief.estimate(), "quality_answer_kept": belief.kept.estimate()}
+            mean |= {
+                key: round(image_scores(project(h, clip.after.camera), truth, clip.after, clip.grid)["quality"], 4)
+                for key, h in answers.items()
+            }
+            losses = log_losses(belief, clip.after.camera, truth.labels)
             followed = _kept(histories[name])
             about = {"sequence": sequence.name, "source": sequence.source, "pause": clip.index, "method": name}
             yield about | mean | losses | least | followed | {"seconds": round(seconds, 2)}

@@ -135,12 +135,23 @@ class WeightedSegmentations:
     @cached_property
     def refinement(self) -> CommonRefinement:
         """The segmentations as a common refinement."""
-        numbered = [canonical(row).astype(np.int64) for row in self.labels]
+        return self.refined_with(np.zeros((0, self.labels.shape[1]), np.int64))
+
+    def refined_with(self, others: np.ndarray) -> CommonRefinement:
+        """The segmentations as a common refinement, after other ones with the labels `others` (n, K)."""
+        numbered = [canonical(row).astype(np.int64) for row in (*others, *self.labels)]
         first = np.cumsum([0, *(int(row.max(initial=0)) for row in numbered)])
         rows = [np.where(row > 0, row + before, 0) for row, before in zip(numbered, first, strict=False)]
-        objects = np.pad(np.array(rows).reshape(self.labels.shape), ((0, 0), (1, 0)))
+        objects = np.pad(np.array(rows).reshape(len(numbered), self.labels.shape[1]), ((0, 0), (1, 0)))
         cells = self.cells.astype(np.int64)
         return CommonRefinement(cells, objects, np.bincount(cells.ravel(), minlength=objects.shape[1]), first)
+
+    def cell_labels(self, image: np.ndarray) -> np.ndarray:
+        """The label (K,) that most pixels of each cell have in an image (H, W) int; 0 if half of them have none."""
+        n, k = int(image.max(initial=0)) + 1, self.labels.shape[1] + 1
+        counts = np.bincount((self.cells.astype(np.int64) * n + image).ravel(), minlength=k * n).reshape(k, n)
+        known = counts[:, 1:].sum(axis=1) > 0.5 * counts.sum(axis=1)
+        return np.where(known, 1 + counts[:, 1:].argmax(axis=1) if n > 1 else 0, 0)[1:]
 
     def are_of(self, camera: Camera) -> bool:
         """Whether the image is that of a camera: same size, intrinsics and pose, up to rounding."""

@@ -39,7 +39,7 @@ from itertools import pairwise
 import numpy as np
 
 from mstfilter.base.errors import InputError
-from mstfilter.scene import as_labels, common_refinement, occupied_box
+from mstfilter.scene import CommonRefinement, as_labels, common_refinement, occupied_box
 from mstfilter.scoring.quality import (
     FORMS,
     STATUSES,
@@ -175,7 +175,11 @@ def object_metrics(table: Overlap) -> dict[str, float]:
 
 def pairwise_quality(labels: Sequence[np.ndarray]) -> np.ndarray:
     """Quality (n, n) of all pairs of label grids of one shape, in the form ``objects``; 1 on the diagonal."""
-    refined = common_refinement(_checked(labels))
+    return refined_quality(common_refinement(_checked(labels)))
+
+
+def refined_quality(refined: CommonRefinement) -> np.ndarray:
+    """`pairwise_quality` (n, n) of the n segmentations of a common refinement."""
     common = refined.overlaps()[1:, 1:]
     sizes = common.diagonal().copy()
     jaccard = common / (sizes[:, None] + sizes - common)

@@ -305,11 +305,7 @@ def _label_image(belief: Belief, camera: Camera) -> np.ndarray:
     image = project(belief.estimate(), camera)
     if belief.seen is None or not belief.seen.are_of(camera):
         return image
-    cells, n = belief.seen.cells.astype(np.int64), int(image.max()) + 1
-    counts = np.bincount((cells * n + image).ravel(), minlength=(int(cells.max()) + 1) * n).reshape(-1, n)
-    shown = np.where(counts[:, 1:].sum(axis=1) > 0.5 * counts.sum(axis=1), 1 + counts[:, 1:].argmax(axis=1), 0)
-    shown[0] = 0
-    return np.asarray(shown[cells])
+    return np.concatenate([[0], belief.seen.cell_labels(image)])[belief.seen.cells]
 
 
 def _mask(belief: Belief, one: BelievedObject, image: np.ndarray, camera: Camera) -> np.ndarray:

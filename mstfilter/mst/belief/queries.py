@@ -62,7 +62,8 @@ from mstfilter.scene import (
     render_hypothesis,
     scaled_area,
 )
-from mstfilter.scoring import least_loss
+from mstfilter.scoring import pairwise_quality
+from mstfilter.scoring.metrics import refined_quality
 from mstfilter.smc import Info, Population, State, first_seen
 
 Action = TypeVar("Action")
@@ -283,16 +284,21 @@ class Belief:
         )
         return np.clip(1 - same, 0, 1)[refined.cells]
 
-    def open_borders(self, camera: Camera, at_least: float = 0.05) -> list[Border]:
+    def open_borders(self, camera: Camera | None = None, at_least: float = 0.05) -> list[Border]:
         """Borders in the image that separate two objects in some hypotheses only, the most uncertain first.
 
         A border is open if the probability that both sides are one object, given that both sides are objects, is
         between `at_least` and 1 - `at_least`. Both sides must be objects with a probability above `at_least`.
         Borders separate the parts of the common refinement of all label images. In an image of 640 x 480, parts of
         fewer than 200 pixels join the nearest larger part, and borders of fewer than 14 pixels are left out. Borders
-        of one object with the same answer in all hypotheses are one border.
+        of one object with the same answer in all hypotheses are one border. The default `camera` is that of the last
+        image, if the belief has its weighted segmentations.
         """
         check_number("at_least", at_least, at_least=0, at_most=0.5)
+        if camera is None:
+            if self.seen is None:
+                raise InputError("the belief does not know the camera of the last image", "open_borders(camera)")
+            camera = self.seen.camera
         refined, mass = self.refined_image(camera)
         least = scaled_area(_LEAST_PART, camera.width * camera.height)
         small = (refined.sizes < least)[refined.cells]
@@ -396,9 +402,23 @@ class Belief:
 
         The loss is 1 - quality (weighted coverage in the form ``objects``). If the true scene is distributed as the
         belief says, no hypothesis is a better single answer.
+
+        The sum over a few kept hypotheses is a noisy estimate of the expected loss. If the belief has all weighted
+        segmentations of the last image, the loss in this image is known better: the same sum over them. The
+        difference of both sums in the image corrects the sum over voxels (a control variate).
         """
+        return self._estimate
+
+    @cached_property
+    def _estimate(self) -> Hypothesis:
         hypotheses, mass = self.distinct
-        return hypotheses[least_loss([h.labels for h in hypotheses], mass)]
+        quality = pairwise_quality([h.labels for h in hypotheses]) @ mass
+        if self.seen is not None and len(hypotheses) > 1:
+            n = len(hypotheses)
+            shown = np.stack([self.seen.cell_labels(project(h, self.seen.camera)) for h in hypotheses])
+            in_image = refined_quality(self.seen.refined_with(shown))[:n]
+            quality = quality + in_image[:, n:] @ self.seen.weights - in_image[:, :n] @ mass
+        return hypotheses[int(np.argmax(quality))]
 
     def objects(self, camera: Camera | None = None, previous: ObjectTable | None = None) -> ObjectTable:
         """One table of the objects: existence, place, shape, visible or hidden, and with what they may be one.

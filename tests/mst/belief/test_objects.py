@@ -221,3 +221,39 @@ def test_main_colour():
     frame = Frame(rgb, np.full((20, 20), 0.8, np.float32), camera)
     found = main_colour(areas_of_colours(frame, np.ones((20, 20), bool)))
     np.testing.assert_allclose(found, (160, 95, 80), atol=12)
+
+
+def test_the_estimate_uses_all_segmentations_of_the_image():
+    """Two equal hypotheses kept, but the weighted segmentations say which reading is the likelier one."""
+    one, two = scene([LEFT, RIGHT], FAR), scene(LEFT, RIGHT, FAR)
+    belief = belief_of((0.5, one), (0.5, two))
+    image = project(two, CAMERA)
+    for p, expected in ((0.8, one), (0.2, two)):
+        seen = WeightedSegmentations(image, np.array([[1, 1, 2], [1, 2, 3]]), np.array([p, 1 - p]), CAMERA)
+        assert replace(belief, seen=seen).estimate() is expected
+    # What the image cannot tell is left to the voxels: the weights of the kept hypotheses.
+    hidden = scene(LEFT, RIGHT, FAR, HIDDEN, hidden=(4,))
+    only = WeightedSegmentations(image, np.array([[1, 2, 3]]), np.ones(1), CAMERA)
+    for p, expected in ((0.7, hidden), (0.3, two)):
+        image_of_hidden = project(hidden, CAMERA)
+        if (image_of_hidden == 4).any():
+            only = WeightedSegmentations(image_of_hidden % 4, np.array([[1, 2, 3]]), np.ones(1), CAMERA)
+        assert belief_of((p, hidden), (1 - p, two), seen=only).estimate() is expected
+
+
+def test_labels_of_cells():
+    cells = np.array([[1, 1, 1, 2, 2], [1, 3, 3, 2, 0]])
+    seen = WeightedSegmentations(cells, np.array([[1, 2, 2]]), np.ones(1), Camera(np.eye(3), 5, 2, CAMERA.pose))
+    image = np.array([[7, 7, 0, 4, 0], [7, 0, 5, 0, 9]])
+    assert seen.cell_labels(image).tolist() == [7, 0, 0]  # of 3 has half of its pixels no object
+    assert seen.refined_with(np.array([[5, 5, 0]])).objects.tolist() == [[0, 1, 1, 0], [0, 2, 3, 3]]
+
+
+def test_the_camera_of_open_borders():
+    belief = two_readings()
+    with pytest.raises(InputError, match="does not know the camera"):
+        belief.open_borders()
+    image = project(scene(LEFT, RIGHT, FAR), CAMERA)
+    seen = WeightedSegmentations(image, np.array([[1, 1, 2], [1, 2, 3]]), np.array([0.3, 0.7]), CAMERA)
+    [border] = replace(belief, seen=seen).open_borders()
+    assert border.one_object == pytest.approx(0.3)
