@@ -23,9 +23,9 @@ rows. Another reading of visible pixels is no further object; the questions abov
 weighted segmentations of the last image, the first three questions about a visible object are asked of its pixels and
 of these segmentations, so the answers do not come in steps of a fifth.
 
-An object has the number of the object of the previous table with which it shares most voxels, or from which it
-descends, one to one. The `id` of a record alone does not follow an object: another hypothesis may be the estimate
-now, and it has its own ids.
+An object has the number of the object of the previous table with which it shares most voxels, from which it descends,
+or which had its colours and size, one to one. The `id` of a record alone does not follow an object: another hypothesis
+may be the estimate now, and it has its own ids.
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ if TYPE_CHECKING:
 _SAME = 0.3  # least intersection over union of one object in two hypotheses
 _SHOWN = 0.01  # least probability of "one" that is noted
 _PART = 0.15  # share of an object from which a part of it counts
-_DESCENT, _LEAST_SCORE = 0.5, 0.2  # worth of an equal id beside the overlap with the previous voxels; least sum
+#: Worth of an equal id and of equal colours and size, beside the overlap with the previous voxels; least sum.
+_DESCENT, _ALIKE, _LEAST_SCORE = 0.5, 0.3, 0.2
 _LEVELS = (np.arange(10) + 0.5) / 10  # the shape at level u has the voxels of at least this probability
 _RANGE = (0.1, 0.9)  # quantiles of the volume
 
@@ -217,12 +218,21 @@ def _numbered(table: ObjectTable, previous: ObjectTable | None) -> ObjectTable:
     score = np.zeros((len(table), len(earlier)))
     for (r, now), (k, before) in product(enumerate(table), enumerate(earlier)):
         descends = (now.record.id, now.record.birth) == (before.record.id, before.record.birth)
-        score[r, k] = _jaccard(now.shape, before.shape) + _DESCENT * descends
+        score[r, k] = _jaccard(now.shape, before.shape) + _DESCENT * descends + _ALIKE * _likeness(now, before)
     pairs = zip(*linear_sum_assignment(-score), strict=True)
     known = {int(r): earlier[k].number for r, k in pairs if score[r, k] >= _LEAST_SCORE}
     fresh = count(last + 1)
     numbers = [known.get(r) or next(fresh) for r in range(len(table))]
     return replace(table.renumbered(numbers), last_number=next(fresh) - 1)
+
+
+def _likeness(a: BelievedObject, b: BelievedObject) -> float:
+    """Common share of the colours that were seen, times the root of the ratio of the volumes; 0 to 1."""
+    seen = [np.sum([v.colours for v in one.record.views if v.colours.any()], axis=0) for one in (a, b)]
+    if not all(np.ndim(colours) and len(colours) for colours in seen):
+        return 0.0
+    common = np.minimum(*(colours / colours.sum() for colours in seen)).sum()
+    return float(common * np.sqrt(min(a.volume, b.volume) / max(a.volume, b.volume)))
 
 
 def _jaccard(a: Crop, b: Crop) -> float:

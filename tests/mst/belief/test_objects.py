@@ -15,6 +15,7 @@ from mstfilter.scene import (
     Frame,
     Hypothesis,
     ObjectRecord,
+    ObjectView,
     Occupancy,
     VoxelGrid,
     WeightedSegmentations,
@@ -186,6 +187,24 @@ def test_an_object_that_jumps_keeps_its_number_by_descent():
     records = tuple(ObjectRecord(r.label, r.id, last_seen=1) for r in scene(LEFT, FAR).objects)
     now = belief_of((1.0, Hypothesis(labels, GRID, records))).objects(previous=before)
     assert [one.number for one in now] == [1, 2]
+
+
+def test_an_object_that_jumps_keeps_its_number_by_its_colours_and_size():
+    def coloured(h, rows):
+        none = np.zeros((0, 0, 0))
+        views = [
+            ObjectView(np.zeros(3, int), none, none, "", colours=np.pad(np.array(row, np.float32), (0, 141)))
+            for row in rows
+        ]
+        pairs = zip(h.objects, views, strict=True)
+        return replace(h, objects=tuple(replace(r, id=50 + seed * 10 + r.label, views=(v,)) for r, v in pairs))
+
+    seed = 0
+    before = belief_of((1.0, coloured(scene(LEFT, FAR, HIDDEN), [(4, 0, 1), (0, 5, 0), (1, 1, 0)]))).objects()
+    seed = 1
+    elsewhere = np.s_[25:31, 2:8, :5], np.s_[2:6, 30:34, :4]
+    now = coloured(scene(LEFT, *elsewhere), [(4, 0, 1), (0, 5, 1), (0, 0, 5)])
+    assert [one.number for one in belief_of((1.0, now)).objects(previous=before)] == [1, 2, 4]
 
 
 def test_the_mesh_is_closed_and_has_the_volume():
