@@ -23,9 +23,9 @@ rows. Another reading of visible pixels is no further object; the questions abov
 weighted segmentations of the last image, the first three questions about a visible object are asked of its pixels and
 of these segmentations, so the answers do not come in steps of a fifth.
 
-An object has the number of the object of the previous table with which it shares most voxels, from which it descends,
-or which had its colours and size, one to one. The `id` of a record alone does not follow an object: another hypothesis
-may be the estimate now, and it has its own ids.
+An object has the number of the object of the previous table with which it shares most voxels, from which it
+descends, or which had its colours and size, one to one. The `id` of a record alone does not follow an object: another
+hypothesis may be the estimate now, and it has its own ids.
 """
 
 from __future__ import annotations
