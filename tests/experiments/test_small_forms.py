@@ -100,6 +100,8 @@ def test_latency(tmp_path):
 def test_readme_picture(tmp_path):
     run_script("readme_picture/make.py", "--smoke", "--out", tmp_path)
     assert read_rgb(tmp_path / "hidden.png").std() > 10 and (tmp_path / "hidden.webp").stat().st_size > 10_000
+    run_script("readme_picture/answer.py", "--smoke", "--out", tmp_path / "answer.png")
+    assert read_rgb(tmp_path / "answer.png").std() > 10
     run_script("readme_picture/differences.py", "--out", tmp_path / "differences.png")
     assert read_rgb(tmp_path / "differences.png").shape[1] >= 840
 

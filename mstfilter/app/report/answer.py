@@ -22,6 +22,7 @@ from typing import Any
 import matplotlib.style
 import numpy as np
 from matplotlib import patheffects
+from matplotlib.axes import Axes
 from matplotlib.patches import Polygon
 
 from mstfilter.app.report.charts import Drawing
@@ -154,9 +155,15 @@ def plot_answer(answer: Answer, image: np.ndarray) -> Drawing:
 
     Hidden objects are dashed. The colour of a border goes from yellow (two objects) to pink (one).
     """
-    x, y, width, height = answer.box
+    _, _, width, height = answer.box
     figure = Drawing(figsize=(6.4, 6.4 * height / width), layout="constrained")
-    axes = figure.subplots()
+    draw_answer(figure.subplots(), answer, image)
+    return figure
+
+
+def draw_answer(axes: Axes, answer: Answer, image: np.ndarray) -> None:
+    """Draw what `plot_answer` shows into the axes of a figure of your own."""
+    x, y, width, height = answer.box
     axes.imshow(image, extent=(0, image.shape[1], image.shape[0], 0))
     axes.set(xlim=(x, x + width), ylim=(y + height, y))
     axes.set_axis_off()
@@ -177,7 +184,6 @@ def plot_answer(answer: Answer, image: np.ndarray) -> Drawing:
             axes.plot(*zip(tag.place, tag.about, strict=True), color="white", lw=0.8)
         place: Any = {"ha": "center", "va": "center", "fontsize": size, "fontweight": "bold"}
         axes.text(*tag.place, tag.text, color=ink, path_effects=glow, **place)
-    return figure
 
 
 def plot_belief(belief: Belief, image: np.ndarray, camera: Camera) -> Drawing:
