@@ -4,9 +4,10 @@
 >>> samples.x.shape, samples.strip.shape, samples.purity
 
 Most scenes ask the question: in `row`, `stack` and `pack`, things that look like several objects are one as often as
-not. Half of these have more groups than the family. The other scenes are `s1` to `s3`. Cameras and sensors are drawn at random, sizes and textures are those for
-tuning. The regions are those that `SeamTree` examines in the tree `border`, and below those of several objects the
-sides of the best division. Some of the regions that plainly are one object are left out.
+not. Half of these have more groups than the family. The other scenes are `s1` to `s3`. Cameras and sensors are drawn
+at random, sizes and textures are those for tuning. The regions are those that `SeamTree` examines in the tree
+`border`, and below those of several objects the sides of the best division. Some of the regions that plainly are one
+object are left out.
 
 Real images with label images give samples in the same way:
 
