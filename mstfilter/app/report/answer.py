@@ -309,9 +309,10 @@ def _label_image(belief: Belief, camera: Camera) -> np.ndarray:
     that most of its pixels show, so outlines are those of the image.
     """
     image = project(belief.estimate(), camera)
-    if belief.seen is None or not belief.seen.are_of(camera):
+    seen = belief.segmentations
+    if seen is None or not seen.are_of(camera):
         return image
-    return np.concatenate([[0], belief.seen.cell_labels(image)])[belief.seen.cells]
+    return np.concatenate([[0], seen.cell_labels(image)])[seen.cells]
 
 
 def _mask(belief: Belief, one: BelievedObject, image: np.ndarray, camera: Camera) -> np.ndarray:

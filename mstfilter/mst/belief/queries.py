@@ -31,7 +31,7 @@ for bits). What the information of an action is, and its `tolerance` (in voxels 
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
 
@@ -69,6 +69,7 @@ from mstfilter.smc import Info, Population, State, first_seen
 Action = TypeVar("Action")
 
 _DEPTH_STEP = 0.01  # voxels: depths are rounded to this step before they are compared
+_REACH = 0.05  # of the width of an image: how far a pixel without a reading may be from one
 _LEAST_PART = 200  # pixels of a part beside an open border, in an image of 640 x 480 pixels
 
 
@@ -413,11 +414,11 @@ class Belief:
     def _estimate(self) -> Hypothesis:
         hypotheses, mass = self.distinct
         quality = pairwise_quality([h.labels for h in hypotheses]) @ mass
-        if self.seen is not None and len(hypotheses) > 1:
+        if (seen := self.segmentations) is not None and len(hypotheses) > 1:
             n = len(hypotheses)
-            shown = np.stack([self.seen.cell_labels(project(h, self.seen.camera)) for h in hypotheses])
-            in_image = refined_quality(self.seen.refined_with(shown))[:n]
-            quality = quality + in_image[:, n:] @ self.seen.weights - in_image[:, :n] @ mass
+            shown = np.stack([seen.cell_labels(project(h, seen.camera)) for h in hypotheses])
+            in_image = refined_quality(seen.refined_with(shown))[:n]
+            quality = quality + in_image[:, n:] @ seen.weights - in_image[:, :n] @ mass
         return hypotheses[int(np.argmax(quality))]
 
     def objects(self, camera: Camera | None = None, previous: ObjectTable | None = None) -> ObjectTable:
@@ -431,10 +432,29 @@ class Belief:
 
     def refined_image(self, camera: Camera) -> tuple[CommonRefinement, np.ndarray]:
         """The cells of the segmentations that a camera sees, and the weights (n,) of the segmentations."""
-        if self.seen is not None and self.seen.are_of(camera):
-            return self.seen.refinement, self.seen.weights
+        seen = self.segmentations
+        if seen is not None and seen.are_of(camera):
+            return seen.refinement, seen.weights
         images, keys = self._images(camera), [h.key for h in self.distinct[0]]
         return memo("refined image", (camera.key, *keys), lambda: common_refinement(images)), self._mass
+
+    @cached_property
+    def segmentations(self) -> WeightedSegmentations | None:
+        """The weighted segmentations of the last image, if they are known, also where it has no depth.
+
+        Segmentations are of depth readings. A pixel without one that shows an object in more than half of the kept
+        hypotheses, by weight, has the cell of the nearest reading of an object.
+        """
+        if self.seen is None:
+            return None
+        cells = self.seen.cells
+        shown = sum(w * (project(h, self.seen.camera) > 0) for h, w in zip(*self.distinct, strict=True))
+        holes = (cells == 0) & (shown > 0.5)
+        if not holes.any() or not cells.any():
+            return self.seen
+        distance, at = distance_transform_edt(cells == 0, return_indices=True)
+        holes &= distance < _REACH * cells.shape[1]
+        return replace(self.seen, cells=np.where(holes, cells[tuple(at)], cells))
 
     def _images(self, camera: Camera) -> list[np.ndarray]:
         check_component("camera", camera, Camera)

@@ -276,3 +276,22 @@ def test_the_camera_of_open_borders():
     seen = WeightedSegmentations(image, np.array([[1, 1, 2], [1, 2, 3]]), np.array([0.3, 0.7]), CAMERA)
     [border] = replace(belief, seen=seen).open_borders()
     assert border.one_object == pytest.approx(0.3)
+
+
+def test_pixels_without_depth_have_the_nearest_segment():
+    """As in an image with holes: cells are known at a half of the pixels, and the hypotheses show the others."""
+    two = scene(LEFT, RIGHT, FAR)
+    image = project(two, CAMERA)
+    cells = np.where(np.indices(image.shape).sum(axis=0) % 2 == 0, image, 0)
+    cells[image == 3] = 0  # too far from a reading
+    seen = WeightedSegmentations(cells, np.array([[1, 1, 2], [1, 2, 3]]), np.array([0.3, 0.7]), CAMERA)
+    belief = belief_of((1.0, two), seen=seen)
+    found = belief.segmentations.cells
+    assert (found[image == 0] == 0).all() and (found[cells > 0] == cells[cells > 0]).all()
+    for k in (1, 2):
+        own = found[image == k]
+        assert (own > 0).all() and (own == k).mean() > 0.9  # others are nearer to the neighbour
+    [column, row], [other, below] = np.argwhere(image == 1)[::-1][0][::-1], np.argwhere(image == 2)[0][::-1]
+    assert belief.same_object_at_pixels(CAMERA, (column, row), (other, below)) == pytest.approx(0.3)
+    nothing = replace(belief, seen=replace(seen, cells=np.zeros_like(cells)))
+    assert nothing.segmentations is nothing.seen and Belief(belief.population).segmentations is None
