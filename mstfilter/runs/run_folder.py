@@ -436,7 +436,8 @@ class RunFolder:
         run, found = self.check_begun(), []
         for t, frame in zip(range(run.n_pauses), run.description["recording"]["pauses"], strict=False):
             hypotheses, weights = run.hypotheses(t), np.asarray(run.info(t)["weights"], dtype=float)
-            found.append(PauseEstimate(hypotheses, weights, frame, hypotheses[0].grid))
+            answer = self.belief(t).estimate_index
+            found.append(PauseEstimate(hypotheses, weights, frame, hypotheses[0].grid, answer))
         return found
 
     def write_metrics(self) -> None:

@@ -13,8 +13,8 @@ Unless stated otherwise, a metric is the unweighted mean over the hypotheses, an
                                                hypotheses
 ``quality_top``                                of the hypothesis of largest weight; if several have it, of the first,
                                                a random draw
-``quality_estimate``                           of the hypothesis of least expected loss (`least_loss`), the best
-                                               single answer
+``quality_estimate``                           of the one answer: `Belief.estimate`, or else the hypothesis of least
+                                               expected loss (`least_loss`)
 ``quality_visible``, ``n_visible``             coverage and number of the true objects that are visible at this pause
 ``quality_hidden``, ``n_hidden``               of those that were visible only at earlier pauses
 ``quality_unseen``, ``n_unseen``               of those that never were visible (`mstfilter.scoring.object_status`)
@@ -57,7 +57,11 @@ _FRAGMENT = 0.1
 
 
 def pause_metrics(
-    labels: Sequence[np.ndarray], weights: np.ndarray, truth: np.ndarray, status: Mapping[int, str]
+    labels: Sequence[np.ndarray],
+    weights: np.ndarray,
+    truth: np.ndarray,
+    status: Mapping[int, str],
+    answer: int | None = None,
 ) -> tuple[dict[str, float], np.ndarray]:
     """Metrics of hypotheses against the ground truth, and the quality (n,) of every hypothesis.
 
@@ -70,6 +74,8 @@ def pause_metrics(
     truth : (X, Y, Z) int
     status : mapping
         True label -> visible, hidden or unseen; empty if unknown.
+    answer : int, optional
+        Index of the hypothesis that is the one answer. Default: that of `least_loss`.
     """
     (truth, *labels), n_free = _cropped(_checked([truth, *labels]))
     which = first_seen(one.tobytes() for one in labels)
@@ -102,9 +108,8 @@ def pause_metrics(
     of_objects = [object_metrics(table) for table in tables]
     row |= {name: mean([one[name] for one in of_objects]) for name in of_objects[0]}
     row["true_objects"] = float(np.count_nonzero(tables[0].labels_b))
-    # Expected quality of each hypothesis against the others, by weight: the largest is the best single answer.
     between = pairwise_quality(distinct)[np.ix_(which, which)]
-    row["quality_estimate"] = float(q[int(np.argmax(between @ weights))])
+    row["quality_estimate"] = float(q[int(np.argmax(between @ weights)) if answer is None else answer])
     row["diversity"] = diversity(between)
     return row, q
 

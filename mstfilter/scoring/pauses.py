@@ -47,12 +47,15 @@ class PauseEstimate:
         Frame of the recording at this pause.
     grid : VoxelGrid, optional
         Grid of the arrays. The default is the grid of the first `Hypothesis`.
+    answer : int, optional
+        Index of the one answer, such as `Belief.estimate`. Default: the hypothesis of least expected loss.
     """
 
     hypotheses: Sequence[Hypothesis | np.ndarray]
     weights: np.ndarray
     frame: int
     grid: VoxelGrid | None = None
+    answer: int | None = None
 
     def __post_init__(self) -> None:
         check_normalised(self.weights, len(self.hypotheses), f"hypotheses at frame {self.frame}")
@@ -136,6 +139,7 @@ def measure_pause(
     hypotheses: Sequence[Hypothesis],
     weights: np.ndarray,
     questions: Questions | None = None,
+    answer: int | None = None,
 ) -> tuple[dict[str, Any], np.ndarray | None]:
     """Metrics of weighted hypotheses at pause `t` of a recording, and the counts of their forecasts.
 
@@ -145,6 +149,8 @@ def measure_pause(
         Sum 1.
     questions : Questions, optional
         Questions of the pause, if they are already known.
+    answer : int, optional
+        Index of the one answer, such as `Belief.estimate`. Default: that of `least_loss`.
 
     Returns
     -------
@@ -164,7 +170,7 @@ def measure_pause(
         return {**row, "diversity": diversity(pairwise_quality(labels))}, None
     known = all(recording.instance(p) is not None for p in recording.pauses[: t + 1])
     status = object_status(recording, t) if known else {}
-    found, q = pause_metrics(labels, weights, truth, status)
+    found, q = pause_metrics(labels, weights, truth, status, answer)
     belief = score_belief(questions or ask(recording, t), hypotheses, weights, truth)
     return {**row, **found, **belief.row, "qualities": q.tolist()}, belief.counts
 
@@ -193,7 +199,8 @@ def _score_pause(pause: int, estimate: PauseEstimate, truth: PauseTruth) -> list
     if truth.questions is not None:
         scores = score_belief(truth.questions, estimate.hypotheses, w, true)
         belief = {**scores.row, "base_rate": scores.base_rate_loss}
-    best_guess, where = least_loss(found, w), "volume" if truth.camera is None else "image"
+    best_guess = least_loss(found, w) if estimate.answer is None else estimate.answer
+    where = "volume" if truth.camera is None else "image"
     rows = []
     for form in FORMS:
         q = np.array([weighted_coverage(one, true, form) for one in found])

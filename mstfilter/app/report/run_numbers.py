@@ -186,7 +186,9 @@ def read_numbers(run: RunFolder, beliefs: bool = True) -> RunNumbers:
             grid, camera = hypotheses[0].grid, run.camera(t)
             seen = render(truth, grid, camera).labels
             visible = shown_objects(seen)
-            metrics = pause_metrics(labels, weights, truth, status_of(truth, visible, shown))[0]
+            metrics = pause_metrics(
+                labels, weights, truth, status_of(truth, visible, shown), run.belief(t).estimate_index
+            )[0]
             shown |= visible
             in_image = float(np.mean([weighted_coverage(project(h, camera), seen) for h in hypotheses]))
         beside, losses = {}, {}
@@ -222,6 +224,6 @@ def _image_score(run: RunFolder, t: int) -> PauseScore | None:
     if image is None:
         return None
     hypotheses, weights = run.hypotheses(t), np.asarray(run.info(t)["weights"], dtype=float)
-    estimate = PauseEstimate(hypotheses, weights, t, hypotheses[0].grid)
+    estimate = PauseEstimate(hypotheses, weights, t, hypotheses[0].grid, run.belief(t).estimate_index)
     scores = score_pauses([estimate], [PauseTruth(image, t, camera=run.camera(t))])
     return next(score for score in scores if score.form == "objects")

@@ -408,10 +408,11 @@ class Belief:
         segmentations of the last image, the loss in this image is known better: the same sum over them. The
         difference of both sums in the image corrects the sum over voxels (a control variate).
         """
-        return self._estimate
+        return self.hypotheses[self.estimate_index]
 
     @cached_property
-    def _estimate(self) -> Hypothesis:
+    def estimate_index(self) -> int:
+        """Index of `estimate` in `hypotheses`."""
         hypotheses, mass = self.distinct
         quality = pairwise_quality([h.labels for h in hypotheses]) @ mass
         if (seen := self.segmentations) is not None and len(hypotheses) > 1:
@@ -419,7 +420,7 @@ class Belief:
             shown = np.stack([seen.cell_labels(project(h, seen.camera)) for h in hypotheses])
             in_image = refined_quality(seen.refined_with(shown))[:n]
             quality = quality + in_image[:, n:] @ seen.weights - in_image[:, :n] @ mass
-        return hypotheses[int(np.argmax(quality))]
+        return self.hypotheses.index(hypotheses[int(np.argmax(quality))])
 
     def objects(self, camera: Camera | None = None, previous: ObjectTable | None = None) -> ObjectTable:
         """One table of the objects: existence, place, shape, visible or hidden, and with what they may be one.

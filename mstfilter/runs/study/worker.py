@@ -280,10 +280,8 @@ def _finish(job: Job, run: RunFolder, recording: Recording, result: Mapping[str,
 def write_measures(run: RunFolder, recording: Recording) -> list[dict[str, Any]]:
     """Return the metrics of each pause of a run, and write the counts of its forecasts into the folder of the run."""
     measured = [
-        measure_pause(
-            recording, t, run.hypotheses(t), np.array(run.info(t)["weights"], dtype=float), run.questions(t)
-        )
-        for t in range(run.n_pauses)
+        measure_pause(recording, t, run.hypotheses(t), one.weights, run.questions(t), one.answer)
+        for t, one in enumerate(run.estimates())
     ]
     counts = [one for _, one in measured if one is not None]
     if len(counts) == len(measured):
