@@ -42,6 +42,7 @@ from mstfilter.base.reading import MAX_FILE, read_arrays, read_model
 from mstfilter.formats import read_labels, read_rgb, write_image
 from mstfilter.formats.folder import CameraFile
 from mstfilter.mst.belief import Belief, ObjectTable
+from mstfilter.runs.run_tables import TABLE_COLUMNS, metrics_rows, object_rows
 from mstfilter.scene import (
     Camera,
     Clip,
@@ -61,7 +62,7 @@ _RESUME = "repeat the command that made the run, to resume it"
 _PAUSE_FILES = (
     rf"(rgb\.png|instance\.png|camera\.json|state\.npz|truth\.npz|segmentations\.npz|info\.json|seconds\.json|{SUMS})"
 )
-_TABLES = rf"(run\.json|metrics\.csv|(report|view)\.html|result\.json|forecasts\.npz|{SUMS})"
+_TABLES = rf"(run\.json|(metrics|objects)\.csv|(report|view)\.html|result\.json|forecasts\.npz|{SUMS})"
 RUN_FILES = re.compile(rf"(compare/[^/]+/)?(pauses/\d+/{_PAUSE_FILES}|{_TABLES})")  #: paths in a run folder
 
 
@@ -425,11 +426,14 @@ class RunFolder:
 
     def objects(self, t: int) -> ObjectTable:
         """The table of objects at pause `t`, with the numbers that objects have had since pause 0."""
-        table = None
-        for k in range(t + 1):
-            table = self.belief(k).objects(previous=table)
-        assert table is not None
-        return table
+        return self.tables(t + 1)[-1]
+
+    def tables(self, n: int | None = None) -> list[ObjectTable]:
+        """The tables of objects of the first `n` pauses, by default of all, in which objects keep their numbers."""
+        found: list[ObjectTable] = []
+        for t in range(self.n_pauses if n is None else n):
+            found.append(self.belief(t).objects(previous=found[-1] if found else None))
+        return found
 
     def estimates(self) -> list[PauseEstimate]:
         """The weighted hypotheses of all pauses, for `mstfilter.scoring.score_pauses`."""
@@ -440,21 +444,8 @@ class RunFolder:
         return found
 
     def write_metrics(self) -> None:
-        """Write metrics.csv, with one row per pause and hypothesis."""
+        """Write metrics.csv, with one row per pause and hypothesis, and objects.csv, one per pause and object."""
         self._check_kept()
-        rows = []
-        for t in range(self.n_pauses):
-            info = self.info(t)
-            for k, hypothesis in enumerate(self.hypotheses(t)):
-                row = {
-                    "pause": t,
-                    "hypothesis": k,
-                    "weight": f"{info['weights'][k]:.6g}",
-                    "n_objects": hypothesis.n_objects,
-                    "voxels": sum(hypothesis.volumes().values()),
-                }
-                for form in FORMS:
-                    row[f"quality_{form}"] = "" if info["quality"] is None else f"{info['quality'][form][k]:.6f}"
-                rows.append(row)
-        write_csv(self.path / "metrics.csv", rows)
-        write_sums(self.path, ["metrics.csv"])
+        write_csv(self.path / "metrics.csv", metrics_rows(self))
+        write_csv(self.path / "objects.csv", object_rows(self), TABLE_COLUMNS)
+        write_sums(self.path, ["metrics.csv", "objects.csv"])

@@ -262,6 +262,32 @@ def _shift(before: BelievedObject, now: BelievedObject) -> float:
     return float(np.linalg.norm(now.centre - before.centre))
 
 
+def table_cells(table: ObjectTable) -> list[dict[str, str]]:
+    """The table of objects as a person reads it: the texts of a row for each object, in the order of the numbers."""
+    return [_object_row(one) for one in sorted(table, key=lambda one: one.number)]
+
+
+def _object_row(one: BelievedObject) -> dict[str, str]:
+    """The texts of a row of the table of objects."""
+    maybe = [f"one with {k} ({share(p)})" for k, p in one.one_with.items() if p > 0.05]
+    maybe += [f"several ({share(one.several)})"] if one.several > 0.05 else []
+    moved = float(np.linalg.norm(one.pose.translation)), float(np.degrees(one.pose.rotation.magnitude()))
+    volume, low, high = (f"{1e6 * v:.0f}" for v in (one.volume, *one.volume_range))
+    return {
+        "number": str(one.number),
+        "colour": hexadecimal(colour(one.number - 1)),
+        "exists": share(one.existence),
+        "seen": "now" if one.visible else f"hidden since pause {one.last_seen + 1}",
+        "middle": ", ".join(f"{100 * x:.0f}" for x in one.centre),
+        "spread": f"{100 * float(np.linalg.norm(one.spread)):.1f}",
+        "size": " × ".join(f"{100 * side:.0f}" for side in one.sides),
+        "volume": volume,
+        "range": f"{low} to {high}",
+        "moved": f"{100 * moved[0]:.0f} cm, {moved[1]:.0f}°" if moved[0] > 1e-3 or moved[1] > 0.5 else "",
+        "maybe": ", ".join(maybe),
+    }
+
+
 def share(p: float) -> str:
     """A probability with two digits, such as .47; .00 and 1.00 are written so."""
     text = f"{p:.2f}"
