@@ -20,6 +20,7 @@ import shutil
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -64,6 +65,13 @@ _PAUSE_FILES = (
 )
 _TABLES = rf"(run\.json|(metrics|objects)\.csv|(report|view)\.html|result\.json|forecasts\.npz|{SUMS})"
 RUN_FILES = re.compile(rf"(compare/[^/]+/)?(pauses/\d+/{_PAUSE_FILES}|{_TABLES})")  #: paths in a run folder
+
+
+def _version(path: Path) -> tuple[str, int, int]:
+    """What changes if a file changes: for keys of the cache."""
+    with reading(path, "a pause of a run"):
+        now = path.stat()
+    return str(path.resolve()), now.st_mtime_ns, now.st_size
 
 
 def as_json(value: Any) -> Any:
@@ -404,10 +412,7 @@ class RunFolder:
         The state is kept in the cache `scene_cache`, because a report reads it many times.
         """
         path = self.pause(t) / "state.npz"
-        with reading(path, "a pause of a run"):
-            now = path.stat()
-        version = (str(path.resolve()), now.st_mtime_ns, now.st_size)
-        return memo("state of a run", version, lambda: load_state(path, HypothesisCodec(), limit=MAX_FILE))
+        return memo("state of a run", _version(path), lambda: load_state(path, HypothesisCodec(), limit=MAX_FILE))
 
     def segmentations(self, t: int) -> WeightedSegmentations | None:
         """All weighted segmentations of the image of pause `t`; None if the update of the filter has none."""
@@ -429,11 +434,21 @@ class RunFolder:
         return self.tables(t + 1)[-1]
 
     def tables(self, n: int | None = None) -> list[ObjectTable]:
-        """The tables of objects of the first `n` pauses, by default of all, in which objects keep their numbers."""
+        """The tables of objects of the first `n` pauses, by default of all, in which objects keep their numbers.
+
+        They are kept in the cache `scene_cache`, because a report needs them several times.
+        """
         found: list[ObjectTable] = []
+        versions: list[Any] = []
         for t in range(self.n_pauses if n is None else n):
-            found.append(self.belief(t).objects(previous=found[-1] if found else None))
+            paths = [self.pause(t) / "state.npz", self.pause(t) / f"{_SEGMENTATIONS}.npz"]
+            versions += [_version(path) for path in paths if path.is_file()]
+            previous = found[-1] if found else None
+            found.append(memo("table of objects", tuple(versions), partial(self._table, t, previous)))
         return found
+
+    def _table(self, t: int, previous: ObjectTable | None) -> ObjectTable:
+        return self.belief(t).objects(previous=previous)
 
     def estimates(self) -> list[PauseEstimate]:
         """The weighted hypotheses of all pauses, for `mstfilter.scoring.score_pauses`."""

@@ -26,7 +26,6 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Polygon
 
 from mstfilter.app.report.charts import Drawing
-from mstfilter.app.report.identities import Identities
 from mstfilter.app.report.pictures import border_colour, close_up, colour, hexadecimal
 from mstfilter.mst.belief import Belief, BelievedObject, Border, ObjectTable
 from mstfilter.runs import RunFolder
@@ -191,30 +190,12 @@ def plot_belief(belief: Belief, image: np.ndarray, camera: Camera) -> Drawing:
     return plot_answer(Answer.of(belief, belief.objects(camera), camera), image)
 
 
-def answers_of_run(run: RunFolder, identities: Identities) -> list[tuple[Answer, list[str]]]:
-    """The answer of each pause of a run, and what changed since the pause before.
-
-    The objects have the numbers that `identities` gives them in all pictures.
-    """
+def answers_of_run(run: RunFolder) -> list[tuple[Answer, list[str]]]:
+    """The answer of each pause of a run, and what changed since the pause before."""
     found: list[tuple[Answer, list[str]]] = []
-    for t in range(run.n_pauses):
-        belief, camera = run.belief(t), run.camera(t)
-        table = belief.objects()
-        answer = Answer.of(belief, table.renumbered(_numbers_of(table, t, identities)), camera)
-        found.append((answer, changes(found[-1][0].table, answer.table) if found else []))
-    return found
-
-
-def _numbers_of(table: ObjectTable, t: int, identities: Identities) -> list[int]:
-    """The numbers that the objects have in all pictures. An object that is believed at two places has two."""
-    found: list[int] = []
-    last = max((n for of in identities.table.values() for n in of.values()), default=0) + 1
-    for one in table:
-        number = identities.of(t, one.hypothesis)[one.label] + 1
-        if number in found:
-            last += 1
-            number = last
-        found.append(number)
+    for t, table in enumerate(run.tables()):
+        answer = Answer.of(run.belief(t), table, run.camera(t))
+        found.append((answer, changes(found[-1][0].table, table) if found else []))
     return found
 
 

@@ -74,7 +74,7 @@ def _pauses(run: RunFolder, numbers: RunNumbers) -> list[dict[str, Any]]:
     """The answer, the image and the hypotheses of each pause, for the template."""
     identities = assign_identities(run)
     scenes = scenes_of_run(run, identities) if numbers.steps else []
-    found = answers_of_run(run, identities)
+    found = answers_of_run(run)
     volumes = [view.hypothesis for scene in scenes for view in scene.views]
     view = viewpoint(volumes, run.camera(0)) if scenes else None
     pauses: list[dict[str, Any]] = []
