@@ -113,10 +113,9 @@ class ImagePairs:
                 break
 
 
-def numbers_of_pixels(pause: Pause, table: ObjectTable) -> np.ndarray:
+def numbers_of_pixels(pause: Pause, belief: Belief, table: ObjectTable) -> np.ndarray:
     """The number (H, W) in the table of the object of the estimate at each pixel of the image of the pause."""
-    assert pause.state.population is not None
-    labels = outlined(Belief(pause.state.population).estimate(), pause.clip.after)
+    labels = outlined(belief.estimate(), pause.clip.after)
     number = np.zeros(int(labels.max()) + 1, np.uint16)
     for one in table:
         if one.in_estimate and one.label < len(number):
@@ -152,7 +151,7 @@ class Publishers:
         camera, time_s = pause.clip.after.camera, pause.clip.times[-1]
         T_base_world = T_base_camera * camera.pose.inv()
         header = make_header(self.types, time_s, of_camera)
-        self.labels.publish(image_message(self.types, header, numbers_of_pixels(pause, table)))
+        self.labels.publish(image_message(self.types, header, numbers_of_pixels(pause, belief, table)))
         header = make_header(self.types, time_s, frame)
         known = {"pause": pause.index, "time": time_s, "frame": frame, "counts": pause.counts}
         self.objects.publish(objects_message(self.types, table, belief.open_borders(camera), T_base_world, **known))

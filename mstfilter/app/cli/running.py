@@ -189,10 +189,10 @@ def objects(
     from mstfilter.runs import TABLE_COLUMNS, RunFolder, chosen_pauses, object_rows, pause_documents
 
     if out is not None:
+        check_output(out)
         check_choice("ending of a table of objects", out.suffix.lower(), (".csv", ".json"))
         if as_json and out.suffix.lower() == ".csv":
             raise InputError(f"--json and --out {out} ask for two formats", "the ending of --out decides")
-        check_output(out)
     folder = RunFolder.open(run)
     chosen = chosen_pauses(folder, pause)
     if out is not None and out.suffix.lower() == ".csv":

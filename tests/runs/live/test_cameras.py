@@ -41,10 +41,10 @@ def test_the_node_has_the_results_of_the_frames_in_its_messages():
     recording = Recording.from_arrays(rgb[kept], metres, K, times=np.array(kept) / FPS, pauses=RULE)
     states = [state for state, _ in QUICK.iterate(recording.clips(), 4)]
     assert [arrays(pause.state) for pause in found] == [arrays(state) for state in states]
-    table = mstfilter.Belief.of_step(found[1].state, found[1].info).objects()
-    [one] = table.renumbered([7])
-    shown = outlined(mstfilter.Belief(found[1].state.population).estimate(), found[1].clip.after)
-    np.testing.assert_array_equal(NODE.numbers_of_pixels(found[1], table.renumbered([7])), 7 * (shown == one.label))
+    belief = mstfilter.Belief.of_step(found[1].state, found[1].info)
+    [one] = table = belief.objects().renumbered([7])
+    shown = outlined(belief.estimate(), found[1].clip.after)
+    np.testing.assert_array_equal(NODE.numbers_of_pixels(found[1], belief, table), 7 * (shown == one.label))
 
 
 @pytest.mark.parametrize("start", [None, 0.0])

@@ -249,7 +249,7 @@ def test_without_a_base_the_frame_is_that_of_the_camera(monkeypatch):
 def test_markers_of_objects_that_are_gone_are_deleted(types, monkeypatch):
     node = Node({}, [])
     publishers = ros_node.Publishers(node, types, least_existence=0.7)
-    monkeypatch.setattr(ros_node, "numbers_of_pixels", lambda pause, table: np.zeros((2, 2), np.uint16))
+    monkeypatch.setattr(ros_node, "numbers_of_pixels", lambda *pause: np.zeros((2, 2), np.uint16))
     clip = SimpleNamespace(after=SimpleNamespace(camera=VIEW), times=(0.0,))
     first = two_readings()
     before = first.objects()
