@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import warnings
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
@@ -13,7 +14,7 @@ import ros_node
 from scipy.spatial.transform import RigidTransform, Rotation
 
 import mstfilter
-from mstfilter.base.errors import InputError
+from mstfilter.base.errors import InputError, InputWarning
 from mstfilter.scene import outlined
 from tests.formats.bags import scene_messages
 from tests.formats.layouts import video
@@ -305,3 +306,23 @@ def test_a_base_frame_needs_a_pose(monkeypatch):
         ros_node.base_finder(None, "base_link", "")
     with pytest.raises(InputError, match=r"(?s)without base_frame.*base_link"):
         ros_node.base_finder(None, "", "0 0 0 0 0 0 1")
+
+
+def test_a_table_at_any_height_is_known_in_the_base_frame():
+    """As on the page on robots: a stream without poses, and one whose poses are those in the base."""
+    rgb, depth, truth = video()
+    T_base_camera = T_BASE_WORLD * CAMERA.pose
+    points = T_BASE_WORLD.apply(TRUE_GRID.centre_of(np.argwhere(truth[0])))
+    for pose in (None, T_base_camera):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", InputWarning)  # the world of the poses is shifted to the table
+            with mstfilter.Stream(CAMERA.K, QUICK, pauses=None) as stream:
+                stream.push(rgb[0], depth[0], 0.0, pose=pose, pause=True)
+                stream.wait()
+                [one] = stream.objects
+                camera = stream.last.clip.after.camera
+        T_base_world = T_base_camera * camera.pose.inv()
+        corners = T_base_world.apply(one.mesh()[0])
+        np.testing.assert_allclose(corners.min(axis=0), points.min(axis=0), atol=0.03)
+        np.testing.assert_allclose(corners.max(axis=0), points.max(axis=0), atol=0.03)
+        np.testing.assert_allclose(one.row(T_base_world)["centre"][2], points[:, 2].mean(), atol=0.02)
