@@ -17,6 +17,7 @@ result that an uninterrupted run has.
 `presets`     filters by name, from TOML files
 `run`         `filter_recording`
 `run_folder`  `RunFolder`: reads and writes the folder of a run
+`run_tables`  the rows of its tables: metrics, objects
 `live`        `Stream`: frames that arrive one by one
 `study`       many runs, compared in pairs
 ============  =========================================================================================

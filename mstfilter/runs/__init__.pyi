@@ -16,3 +16,9 @@ from mstfilter.runs.run_folder import (
     as_json as as_json,
     write_json as write_json,
 )
+from mstfilter.runs.run_tables import (
+    TABLE_COLUMNS as TABLE_COLUMNS,
+    chosen_pauses as chosen_pauses,
+    object_rows as object_rows,
+    pause_documents as pause_documents,
+)

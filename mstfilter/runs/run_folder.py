@@ -20,6 +20,7 @@ import shutil
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -42,6 +43,7 @@ from mstfilter.base.reading import MAX_FILE, read_arrays, read_model
 from mstfilter.formats import read_labels, read_rgb, write_image
 from mstfilter.formats.folder import CameraFile
 from mstfilter.mst.belief import Belief, ObjectTable
+from mstfilter.runs.run_tables import TABLE_COLUMNS, metrics_rows, object_rows
 from mstfilter.scene import (
     Camera,
     Clip,
@@ -61,8 +63,15 @@ _RESUME = "repeat the command that made the run, to resume it"
 _PAUSE_FILES = (
     rf"(rgb\.png|instance\.png|camera\.json|state\.npz|truth\.npz|segmentations\.npz|info\.json|seconds\.json|{SUMS})"
 )
-_TABLES = rf"(run\.json|metrics\.csv|(report|view)\.html|result\.json|forecasts\.npz|{SUMS})"
+_TABLES = rf"(run\.json|(metrics|objects)\.csv|(report|view)\.html|result\.json|forecasts\.npz|{SUMS})"
 RUN_FILES = re.compile(rf"(compare/[^/]+/)?(pauses/\d+/{_PAUSE_FILES}|{_TABLES})")  #: paths in a run folder
+
+
+def _version(path: Path) -> tuple[str, int, int]:
+    """What changes if a file changes: for keys of the cache."""
+    with reading(path, "a pause of a run"):
+        now = path.stat()
+    return str(path.resolve()), now.st_mtime_ns, now.st_size
 
 
 def as_json(value: Any) -> Any:
@@ -403,10 +412,7 @@ class RunFolder:
         The state is kept in the cache `scene_cache`, because a report reads it many times.
         """
         path = self.pause(t) / "state.npz"
-        with reading(path, "a pause of a run"):
-            now = path.stat()
-        version = (str(path.resolve()), now.st_mtime_ns, now.st_size)
-        return memo("state of a run", version, lambda: load_state(path, HypothesisCodec(), limit=MAX_FILE))
+        return memo("state of a run", _version(path), lambda: load_state(path, HypothesisCodec(), limit=MAX_FILE))
 
     def segmentations(self, t: int) -> WeightedSegmentations | None:
         """All weighted segmentations of the image of pause `t`; None if the update of the filter has none."""
@@ -425,11 +431,24 @@ class RunFolder:
 
     def objects(self, t: int) -> ObjectTable:
         """The table of objects at pause `t`, with the numbers that objects have had since pause 0."""
-        table = None
-        for k in range(t + 1):
-            table = self.belief(k).objects(previous=table)
-        assert table is not None
-        return table
+        return self.tables(t + 1)[-1]
+
+    def tables(self, n: int | None = None) -> list[ObjectTable]:
+        """The tables of objects of the first `n` pauses, by default of all, in which objects keep their numbers.
+
+        They are kept in the cache `scene_cache`, because a report needs them several times.
+        """
+        found: list[ObjectTable] = []
+        versions: list[Any] = []
+        for t in range(self.n_pauses if n is None else n):
+            paths = [self.pause(t) / "state.npz", self.pause(t) / f"{_SEGMENTATIONS}.npz"]
+            versions += [_version(path) for path in paths if path.is_file()]
+            previous = found[-1] if found else None
+            found.append(memo("table of objects", tuple(versions), partial(self._table, t, previous)))
+        return found
+
+    def _table(self, t: int, previous: ObjectTable | None) -> ObjectTable:
+        return self.belief(t).objects(previous=previous)
 
     def estimates(self) -> list[PauseEstimate]:
         """The weighted hypotheses of all pauses, for `mstfilter.scoring.score_pauses`."""
@@ -441,21 +460,8 @@ class RunFolder:
         return found
 
     def write_metrics(self) -> None:
-        """Write metrics.csv, with one row per pause and hypothesis."""
+        """Write metrics.csv, with one row per pause and hypothesis, and objects.csv, one per pause and object."""
         self._check_kept()
-        rows = []
-        for t in range(self.n_pauses):
-            info = self.info(t)
-            for k, hypothesis in enumerate(self.hypotheses(t)):
-                row = {
-                    "pause": t,
-                    "hypothesis": k,
-                    "weight": f"{info['weights'][k]:.6g}",
-                    "n_objects": hypothesis.n_objects,
-                    "voxels": sum(hypothesis.volumes().values()),
-                }
-                for form in FORMS:
-                    row[f"quality_{form}"] = "" if info["quality"] is None else f"{info['quality'][form][k]:.6f}"
-                rows.append(row)
-        write_csv(self.path / "metrics.csv", rows)
-        write_sums(self.path, ["metrics.csv"])
+        write_csv(self.path / "metrics.csv", metrics_rows(self))
+        write_csv(self.path / "objects.csv", object_rows(self), TABLE_COLUMNS)
+        write_sums(self.path, ["metrics.csv", "objects.csv"])

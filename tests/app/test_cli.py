@@ -45,7 +45,10 @@ def test_run_and_report(two_pauses, tmp_path, capsys):
     few = ("n=3", "n_proposed=2")
     code, out, err = call("run", two_pauses, *few, "--out", run, "--seed", 4, "--no-report", capsys=capsys)
     assert code == 0, err
-    assert "pause 1     3 hypotheses" in out
+    assert "pause 1     " in out and out.count("            3 hypotheses, ESS ") == 2
+    table = RunFolder.open(run).objects(1)
+    assert f"{sum(one.in_estimate for one in table)} objects." in out
+    assert (run / "objects.csv").read_text().count("\n1,") == len(table)
     assert RunFolder.open(run).description["seed"] == 4
     assert not (run / "report.html").exists()
     code, out, err = call("report", run, "--out", tmp_path / "r.html", capsys=capsys)
@@ -62,6 +65,7 @@ WRITERS = {
     "study": ("none.toml", "--out"),
     "train": ("border", "--out"),
     "report": ("none", "--out"),
+    "objects": ("none", "--out"),
     "view": ("none", "--out"),
     "quality": ("none", "none", "--csv"),
 }

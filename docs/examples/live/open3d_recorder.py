@@ -9,8 +9,7 @@ import mstfilter
 
 
 def show(pause):
-    scene = mstfilter.Belief(pause.state.population).estimate()
-    print(f"pause {pause.index}: {scene.n_objects} objects, {pause.latency_s:.1f} s after the last frame")
+    print(f"pause {pause.index}: {stream.objects}\n  {pause.latency_s:.1f} s after the last frame")
 
 
 settings = o3d.io.AzureKinectSensorConfig()

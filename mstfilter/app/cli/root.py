@@ -82,12 +82,9 @@ def print_summary(run: RunFolder, numbers: RunNumbers) -> None:
     from textwrap import fill
 
     from mstfilter.app.report.answer import answers_of_run
-    from mstfilter.app.report.identities import assign_identities
 
     indent = 12 * " "
-    for t, (step, (answer, happened)) in enumerate(
-        zip(numbers.steps, answers_of_run(run, assign_identities(run)), strict=True)
-    ):
+    for t, (step, (answer, happened)) in enumerate(zip(numbers.steps, answers_of_run(run), strict=True)):
         text = " ".join([*happened, *answer.sentences])
         print(fill(f"{f'pause {t}':<12}{text}", 100, subsequent_indent=indent))
         n = len(step.objects)

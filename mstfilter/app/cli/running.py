@@ -1,4 +1,4 @@
-"""Commands about recordings and runs: run, demo, simulate, report, view, convert, quality."""
+"""Commands about recordings and runs: run, demo, simulate, report, objects, view, convert, quality."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from mstfilter.app.cli.root import (
     safe_name,
 )
 from mstfilter.app.report.progress import progress_bar
-from mstfilter.base.errors import InputError
-from mstfilter.base.files import atomic_folder, check_output, locked, write_csv
+from mstfilter.base.errors import InputError, check_choice
+from mstfilter.base.files import atomic_folder, check_output, locked, write_csv, write_text
 
 _DEMO = "occlusion"  # the family of the demo
 
@@ -176,6 +176,39 @@ def report(
     from mstfilter.app.report import write_report
 
     print(f"report      {write_report(run, out)}")
+
+
+@app.command()
+def objects(
+    run: Annotated[Path, typer.Argument(help="Run folder, finished or not.")],
+    pause: Annotated[int | None, typer.Option(help="One pause, from 0; -1 is the last. Default: all.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, with the open borders.")] = False,
+    out: Annotated[Path | None, typer.Option(help="File to write instead: .csv or .json.")] = None,
+) -> None:
+    """Print the objects of a run: where, how certain, visible or hidden, with what they may be one."""
+    from mstfilter.runs import TABLE_COLUMNS, RunFolder, chosen_pauses, object_rows, pause_documents
+
+    if out is not None:
+        check_output(out)
+        check_choice("ending of a table of objects", out.suffix.lower(), (".csv", ".json"))
+        if as_json and out.suffix.lower() == ".csv":
+            raise InputError(f"--json and --out {out} ask for two formats", "the ending of --out decides")
+    folder = RunFolder.open(run)
+    chosen = chosen_pauses(folder, pause)
+    if out is not None and out.suffix.lower() == ".csv":
+        write_csv(out, object_rows(folder, chosen), TABLE_COLUMNS)
+    elif out is not None or as_json:
+        text = json.dumps(pause_documents(folder, chosen)) + "\n"
+        if out is None:
+            sys.stdout.write(text)
+        else:
+            write_text(out, text)
+    else:
+        times, tables = folder.description["recording"]["times"], folder.tables(chosen[-1] + 1)
+        for t in chosen:
+            print(f"pause {t}, {times[t]:.1f} s: {tables[t]!r}")
+    if out is not None:
+        print(f"objects     {out}")
 
 
 @app.command()

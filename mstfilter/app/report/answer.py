@@ -26,7 +26,6 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Polygon
 
 from mstfilter.app.report.charts import Drawing
-from mstfilter.app.report.identities import Identities
 from mstfilter.app.report.pictures import border_colour, close_up, colour, hexadecimal
 from mstfilter.mst.belief import Belief, BelievedObject, Border, ObjectTable
 from mstfilter.runs import RunFolder
@@ -191,30 +190,12 @@ def plot_belief(belief: Belief, image: np.ndarray, camera: Camera) -> Drawing:
     return plot_answer(Answer.of(belief, belief.objects(camera), camera), image)
 
 
-def answers_of_run(run: RunFolder, identities: Identities) -> list[tuple[Answer, list[str]]]:
-    """The answer of each pause of a run, and what changed since the pause before.
-
-    The objects have the numbers that `identities` gives them in all pictures.
-    """
+def answers_of_run(run: RunFolder) -> list[tuple[Answer, list[str]]]:
+    """The answer of each pause of a run, and what changed since the pause before."""
     found: list[tuple[Answer, list[str]]] = []
-    for t in range(run.n_pauses):
-        belief, camera = run.belief(t), run.camera(t)
-        table = belief.objects()
-        answer = Answer.of(belief, table.renumbered(_numbers_of(table, t, identities)), camera)
-        found.append((answer, changes(found[-1][0].table, answer.table) if found else []))
-    return found
-
-
-def _numbers_of(table: ObjectTable, t: int, identities: Identities) -> list[int]:
-    """The numbers that the objects have in all pictures. An object that is believed at two places has two."""
-    found: list[int] = []
-    last = max((n for of in identities.table.values() for n in of.values()), default=0) + 1
-    for one in table:
-        number = identities.of(t, one.hypothesis)[one.label] + 1
-        if number in found:
-            last += 1
-            number = last
-        found.append(number)
+    for t, table in enumerate(run.tables()):
+        answer = Answer.of(run.belief(t), table, run.camera(t))
+        found.append((answer, changes(found[-1][0].table, table) if found else []))
     return found
 
 
@@ -260,6 +241,32 @@ def _shift(before: BelievedObject, now: BelievedObject) -> float:
     if same and np.allclose(before.pose.as_matrix(), now.pose.as_matrix()):
         return 0.0
     return float(np.linalg.norm(now.centre - before.centre))
+
+
+def table_cells(table: ObjectTable) -> list[dict[str, str]]:
+    """The table of objects as a person reads it: the texts of a row for each object, in the order of the numbers."""
+    return [_object_row(one) for one in sorted(table, key=lambda one: one.number)]
+
+
+def _object_row(one: BelievedObject) -> dict[str, str]:
+    """The texts of a row of the table of objects."""
+    maybe = [f"one with {k} ({share(p)})" for k, p in one.one_with.items() if p > 0.05]
+    maybe += [f"several ({share(one.several)})"] if one.several > 0.05 else []
+    moved = float(np.linalg.norm(one.pose.translation)), float(np.degrees(one.pose.rotation.magnitude()))
+    volume, low, high = (f"{1e6 * v:.0f}" for v in (one.volume, *one.volume_range))
+    return {
+        "number": str(one.number),
+        "colour": hexadecimal(colour(one.number - 1)),
+        "exists": share(one.existence),
+        "seen": "now" if one.visible else f"hidden since pause {one.last_seen + 1}",
+        "middle": ", ".join(f"{100 * x:.0f}" for x in one.centre),
+        "spread": f"{100 * float(np.linalg.norm(one.spread)):.1f}",
+        "size": " × ".join(f"{100 * side:.0f}" for side in one.sides),
+        "volume": volume,
+        "range": f"{low} to {high}",
+        "moved": f"{100 * moved[0]:.0f} cm, {moved[1]:.0f}°" if moved[0] > 1e-3 or moved[1] > 0.5 else "",
+        "maybe": ", ".join(maybe),
+    }
 
 
 def share(p: float) -> str:

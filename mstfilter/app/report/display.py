@@ -4,6 +4,7 @@
 >>> hypothesis.show()                       # voxels that can be rotated with the mouse, also outside a notebook
 >>> hypothesis.show().save("scene.html")
 >>> state.population.plot()                 # hypotheses by weight, or the distribution of each coordinate
+>>> belief.objects()                        # in a notebook: the table of the report
 
 Classes in `mstfilter.scene`, `mstfilter.smc` and `mstfilter.mst.belief` have methods `plot`, `show` and
 `_repr_html_`, which import this module when they are called (`mstfilter.base.lazy.late`). HTML pages load nothing
@@ -19,11 +20,12 @@ from typing import Any
 import matplotlib.style
 import numpy as np
 
+from mstfilter.app.report.answer import table_cells
 from mstfilter.app.report.charts import Drawing
 from mstfilter.app.report.identities import match_objects, weigh_distinct
-from mstfilter.app.report.page import short_text
+from mstfilter.app.report.page import fill_template, short_text
 from mstfilter.app.report.pictures import colour, data_uri, jpeg_bytes, png_bytes, viewpoint, voxel_picture
-from mstfilter.mst.belief import Belief
+from mstfilter.mst.belief import Belief, ObjectTable
 from mstfilter.scene import Clip, Frame, Hypothesis, Recording
 from mstfilter.smc import Infos, Population, State, as_matrix
 
@@ -90,7 +92,9 @@ def plot_population(population: Population) -> Drawing:
 
 
 def to_html(value: Any) -> str:
-    """HTML that shows an object of the package in a notebook: text, and pictures or a table of steps."""
+    """HTML that shows an object of the package in a notebook: text, and pictures, a table of steps or of objects."""
+    if isinstance(value, ObjectTable):
+        return fill_template("objects.html", {}, head=repr(value).splitlines()[0], rows=table_cells(value))
     text = f'<pre style="margin:0">{html.escape(repr(value))}</pre>'
     shown = [] if isinstance(value, Infos) else pictures_of(value)
     height = 150 if len(shown) > 1 else 240

@@ -4,10 +4,12 @@
 >>> identities.of(t, k)                             # {label: identity 0, 1, 2, ...} of hypothesis k at pause t
 >>> identities.colours(t, k)                        # {label: (r, g, b)}
 
-Each hypothesis numbers its objects independently. Within a pause, objects are matched by the overlap of their voxels.
-From pause to pause, an object is matched by its stable id if its hypothesis has a known parent. Without a known
-parent, an object is matched by overlap with objects of the last pause. Objects of the ground truth, if known, are
-matched first, and each true label keeps its identity. Identities are used only for display and affect no score.
+Each hypothesis numbers its objects independently. The objects in the tables of the run (`RunFolder.tables`) have the
+identity ``number - 1``, so pictures, objects.csv and `RunFolder.objects` have the same numbers. Within a pause, other
+objects are matched with these by the overlap of their voxels. From pause to pause, an object is matched by its stable
+id if its hypothesis has a known parent, otherwise by overlap with objects of the last pause. A label of the ground
+truth, if known, has one identity at all pauses: that of the object of the tables with which it shares most voxels.
+Identities are used only for display and affect no score.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mstfilter.app.report.pictures import Colour, colour
+from mstfilter.mst.belief import ObjectTable
 from mstfilter.runs import RunFolder
 from mstfilter.scene import Hypothesis
 from mstfilter.scoring import overlap
@@ -51,11 +54,33 @@ class Identities:
 
 def assign_identities(run: RunFolder) -> Identities:
     """Identities of all objects of a run, assigned pause by pause."""
-    assignment = _Assignment()
-    for t in range(run.n_pauses):
+    tables = run.tables()
+    assignment, of_truth = _Assignment(tables[-1].last_number if tables else 0), _identities_of_truth(run, tables)
+    for t, table in enumerate(tables):
+        given: dict[int, dict[int, int]] = {}
+        for one in table:  # those of the estimate are first
+            given.setdefault(one.hypothesis, {})[one.label] = one.number - 1
+        given[TRUTH] = of_truth
         info = run.info(t)
-        assignment.add(t, run.hypotheses(t), info["weights"], info["parents"].get("previous"), run.truth(t))
+        assignment.add(t, run.hypotheses(t), info["weights"], info["parents"].get("previous"), run.truth(t), given)
     return Identities(assignment.table)
+
+
+def _identities_of_truth(run: RunFolder, tables: Sequence[ObjectTable]) -> dict[int, int]:
+    """``{true label: identity}``, one to one, by the overlap with the objects of the tables over all pauses."""
+    from scipy.optimize import linear_sum_assignment
+
+    known = [(t, truth) for t in range(len(tables)) if (truth := run.truth(t)) is not None]
+    labels = sorted({int(label) for _, truth in known for label in np.unique(truth) if label})
+    n = tables[-1].last_number if tables else 0
+    score = np.zeros((len(labels), n))
+    for t, truth in known:
+        for one in (one for one in tables[t] if one.in_estimate):
+            image = np.where(run.hypotheses(t)[one.hypothesis].labels == one.label, one.number, 0)
+            score += _overlaps(truth, image, labels, n)
+    pairs = zip(*(x.tolist() for x in linear_sum_assignment(-score)), strict=True)
+    found = {labels[row]: column for row, column in pairs if score[row, column] >= _LEAST_SCORE}
+    return found | {label: n + k for k, label in enumerate(label for label in labels if label not in found)}
 
 
 def match_runs(runs: Sequence[RunFolder], t: int) -> list[Identities]:
@@ -76,15 +101,15 @@ def match_objects(hypotheses: Sequence[Hypothesis], weights: Sequence[float]) ->
 
 
 class _Assignment:
-    """Identities of the objects of all pauses that were added so far."""
+    """Identities of the objects of all pauses that were added so far. The first `n` are given to `add`."""
 
-    def __init__(self) -> None:
+    def __init__(self, n: int = 0) -> None:
         self.table: dict[tuple[int, int], dict[int, int]] = {}
         self._ids: dict[tuple[int, int], dict[int, int]] = {}  # (pause, hypothesis) -> {stable id: identity}
         # Voxels with identity + 1 (0 for none) of the truth and the heaviest hypotheses: of this pause, of the last.
         self._now: list[np.ndarray] = []
         self._before: list[np.ndarray] = []
-        self._n = 0
+        self._n = n
 
     def add(
         self,
@@ -93,15 +118,30 @@ class _Assignment:
         weights: Sequence[float],
         parents: Sequence[int] | None,
         truth: np.ndarray | None,
+        given: Mapping[int, Mapping[int, int]] | None = None,
     ) -> None:
-        """Add the ground truth of pause `t`, and then the hypotheses of this pause in order of weight."""
+        """Add the hypotheses of pause `t` and its ground truth.
+
+        The identities `given`, ``{hypothesis: {label: identity}}``, are kept. These hypotheses are first, then the
+        truth, then the others in order of weight.
+        """
         self._before, self._now = self._now, []
-        if truth is not None:
-            labels = np.flatnonzero(np.bincount(truth.ravel(), minlength=1)[1:]) + 1
-            ids = {int(k): int(k) for k in labels}
-            self._assign(t, TRUTH, truth, ids, self._ids.get((t - 1, TRUTH), {}), _TRUTH_SCORE)
+        given = given or {}
+        known: dict[bytes, dict[int, int]] = {}
+        for k, of in given.items():
+            if k != TRUTH:
+                known.setdefault(hypotheses[k].key, {}).update(of)
         first: dict[bytes, int] = {}
-        for k in order_by_weight(weights):
+        for k in [*given, TRUTH, *order_by_weight(weights)]:
+            if (t, k) in self.table:
+                continue
+            if k == TRUTH:
+                if truth is not None:
+                    labels = np.flatnonzero(np.bincount(truth.ravel(), minlength=1)[1:]) + 1
+                    ids = {int(label): int(label) for label in labels}
+                    inherited = self._ids.get((t - 1, TRUTH), {})
+                    self._assign(t, TRUTH, truth, ids, inherited, _TRUTH_SCORE, given.get(TRUTH))
+                continue
             h = hypotheses[k]
             ids = {o.label: o.id for o in h.objects}
             same = first.setdefault(h.key, k)
@@ -111,7 +151,7 @@ class _Assignment:
                 continue
             parent = -2 if parents is None else int(parents[k])
             score = _DESCENT_SCORES[truth is not None]
-            self._assign(t, k, h.labels, ids, self._ids.get((t - 1, parent), {}), score)
+            self._assign(t, k, h.labels, ids, self._ids.get((t - 1, parent), {}), score, known.get(h.key))
 
     def _assign(
         self,
@@ -121,6 +161,7 @@ class _Assignment:
         ids: Mapping[int, int],
         inherited: Mapping[int, int],
         descent_score: float,
+        given: Mapping[int, int] | None = None,
     ) -> None:
         from scipy.optimize import linear_sum_assignment
 
@@ -135,9 +176,13 @@ class _Assignment:
             identity = inherited.get(ids[label])
             if identity is not None:
                 score[row, identity] += descent_score
+        given = {label: identity for label, identity in (given or {}).items() if label in ids}
+        self._n = max([self._n, *(identity + 1 for identity in given.values())])
+        score[[row for row, label in enumerate(present) if label in given]] = 0
+        score[:, [identity for identity in given.values() if identity < score.shape[1]]] = 0
         rows, columns = linear_sum_assignment(-score)
         pairs = zip(rows.tolist(), columns.tolist(), strict=True)
-        found = {present[r]: int(c) for r, c in pairs if score[r, c] >= _LEAST_SCORE}
+        found = {present[r]: int(c) for r, c in pairs if score[r, c] >= _LEAST_SCORE} | given
         for label in present:
             if label not in found:
                 found[label] = self._n

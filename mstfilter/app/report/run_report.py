@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.app.report.answer import Answer, answers_of_run, share
+from mstfilter.app.report.answer import Answer, answers_of_run, table_cells
 from mstfilter.app.report.export import mesh_bytes
 from mstfilter.app.report.figures import quality_figure, reliability_figure
 from mstfilter.app.report.identities import assign_identities
@@ -34,7 +34,7 @@ from mstfilter.app.report.pictures import (
 from mstfilter.app.report.run_numbers import SLOT_TITLES, RunNumbers, read_numbers
 from mstfilter.app.report.scenes import ShownHypothesis, ShownPause, scenes_of_run
 from mstfilter.app.report.viewer import run_page
-from mstfilter.mst.belief import BelievedObject, ObjectTable
+from mstfilter.mst.belief import ObjectTable
 from mstfilter.runs import RunFolder
 from mstfilter.scene import Camera, Hypothesis, project
 from mstfilter.scoring import forecast_table
@@ -74,7 +74,7 @@ def _pauses(run: RunFolder, numbers: RunNumbers) -> list[dict[str, Any]]:
     """The answer, the image and the hypotheses of each pause, for the template."""
     identities = assign_identities(run)
     scenes = scenes_of_run(run, identities) if numbers.steps else []
-    found = answers_of_run(run, identities)
+    found = answers_of_run(run)
     volumes = [view.hypothesis for scene in scenes for view in scene.views]
     view = viewpoint(volumes, run.camera(0)) if scenes else None
     pauses: list[dict[str, Any]] = []
@@ -92,29 +92,8 @@ def _answer(answer: Answer, mesh: bool) -> dict[str, Any]:
         "sentences": answer.sentences,
         "outlines": [(one, hexadecimal(colour(one.number - 1))) for one in answer.outlines],
         "borders": [(one, hexadecimal(border_colour(one.one_object))) for one in answer.borders],
-        "rows": [_object_row(one) for one in sorted(answer.table, key=lambda one: one.number)],
+        "rows": table_cells(answer.table),
         "mesh": _mesh(answer.table) if mesh else "",
-    }
-
-
-def _object_row(one: BelievedObject) -> dict[str, str]:
-    """A row of the table of objects."""
-    maybe = [f"one with {k} ({share(p)})" for k, p in one.one_with.items() if p > 0.05]
-    maybe += [f"several ({share(one.several)})"] if one.several > 0.05 else []
-    moved = float(np.linalg.norm(one.pose.translation)), float(np.degrees(one.pose.rotation.magnitude()))
-    volume, low, high = (f"{1e6 * v:.0f}" for v in (one.volume, *one.volume_range))
-    return {
-        "number": str(one.number),
-        "colour": hexadecimal(colour(one.number - 1)),
-        "exists": share(one.existence),
-        "seen": "now" if one.visible else f"hidden since pause {one.last_seen + 1}",
-        "middle": ", ".join(f"{100 * x:.0f}" for x in one.centre),
-        "spread": f"{100 * float(np.linalg.norm(one.spread)):.1f}",
-        "size": " × ".join(f"{100 * side:.0f}" for side in one.sides),
-        "volume": volume,
-        "range": f"{low} to {high}",
-        "moved": f"{100 * moved[0]:.0f} cm, {moved[1]:.0f}°" if moved[0] > 1e-3 or moved[1] > 0.5 else "",
-        "maybe": ", ".join(maybe),
     }
 
 

@@ -17,7 +17,6 @@ import numpy as np
 
 from mstfilter.app.report.identities import TRUTH, Identities, assign_identities, names_of, weigh_distinct
 from mstfilter.app.report.pictures import Colour, colour, data_uri, overlay_layer, png_bytes, voxel_picture
-from mstfilter.mst.belief import Belief
 from mstfilter.runs import RunFolder
 from mstfilter.scene import Camera, Frame, Hypothesis, Recording, VoxelGrid, project
 
@@ -90,9 +89,8 @@ def scene_of_run(run: RunFolder, t: int, identities: Identities, n_views: int = 
 
     The estimate (`Belief.estimate`) is the first hypothesis, and the others are sorted by weight.
     """
-    info, hypotheses, truth, population = run.info(t), run.hypotheses(t), run.truth(t), run.state(t).population
-    assert population is not None
-    estimate = Belief(population).estimate().key
+    info, hypotheses, truth = run.info(t), run.hypotheses(t), run.truth(t)
+    estimate = run.belief(t).estimate().key
     views, groups = [], weigh_distinct(hypotheses, info["weights"])
     groups.sort(key=lambda group: hypotheses[group[0][0]].key != estimate)
     for place, (members, weight) in enumerate(groups[:n_views]):

@@ -6,6 +6,8 @@
 
 =============  =========================================================================================
 `queries`      `Belief`: probabilities, expected information, the estimate
+`objects`      `ObjectTable`: the objects, with existence, place, shape, hidden or not
+`rows`         the table as plain types, in any frame, for JSON and CSV
 `information`  entropies and mutual information of weighted outcomes
 `pushes`       `push_candidates`: pushes that decide between one object and two
 `similarity`   similarity and equality of hypotheses, for resamplers that compare particles

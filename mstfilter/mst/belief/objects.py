@@ -5,7 +5,7 @@
 >>> table[0].existence, table[0].centre, table[0].spread, table[0].visible
 >>> table[0].one_with                                  # {number of another object: probability that both are one}
 >>> corners, triangles = table[0].mesh()               # a smooth surface in world metres
->>> table.rows()                                       # for JSON or a data frame
+>>> table.rows()                                       # for JSON or a data frame; table.rows(T_base_world)
 >>> later.objects(previous=table)                      # the same objects keep their numbers
 
 Each hypothesis numbers its objects as it likes and divides the scene in its own way. So the table takes the objects
@@ -42,6 +42,7 @@ from scipy.spatial.transform import RigidTransform
 
 from mstfilter.base.errors import InputError
 from mstfilter.base.lazy import late
+from mstfilter.mst.belief.rows import object_row
 from mstfilter.scene import Camera, CommonRefinement, Crop, Hypothesis, ObjectRecord, main_colour, project
 
 if TYPE_CHECKING:
@@ -106,28 +107,9 @@ class BelievedObject:
         parts += [f"{p:.2f} that it is one with {other}" for other, p in self.one_with.items()]
         return ", ".join(parts)
 
-    def row(self) -> dict[str, Any]:
-        """The figures by name, of plain types: for JSON, CSV or a data frame."""
-        turn = self.T_world_box.rotation.as_quat()
-        vectors = {
-            "centre": self.centre, "spread": self.spread, "box_centre": self.T_world_box.translation,
-            "box_quaternion_xyzw": turn, "sides": self.sides, "moved": self.pose.translation,
-            "turned_quaternion_xyzw": self.pose.rotation.as_quat(),
-        }  # fmt: skip
-        return {
-            "object": self.number,
-            "id": self.record.id,
-            "in_estimate": self.in_estimate,
-            "existence": round(self.existence, 4),
-            "visible": self.visible,
-            "last_seen": self.last_seen,
-            "several": round(self.several, 4),
-            "one_with": {str(other): round(p, 4) for other, p in self.one_with.items()},
-            **{name: [round(float(x), 5) for x in values] for name, values in vectors.items()},
-            "volume": float(f"{self.volume:.4g}"),
-            "volume_range": [float(f"{v:.4g}") for v in self.volume_range],
-            "colour": None if self.colour is None else list(self.colour),
-        }
+    def row(self, T_frame_world: RigidTransform | None = None) -> dict[str, Any]:
+        """The figures by name, of plain types, in the frame of the grid or another one: for JSON or a data frame."""
+        return object_row(self, T_frame_world)
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,9 +149,9 @@ class ObjectTable:
 
     _repr_html_ = late("mstfilter.app.report.display:to_html", "What a notebook shows.")
 
-    def rows(self) -> list[dict[str, Any]]:
+    def rows(self, T_frame_world: RigidTransform | None = None) -> list[dict[str, Any]]:
         """`BelievedObject.row` of every object."""
-        return [one.row() for one in self]
+        return [one.row(T_frame_world) for one in self]
 
     def renumbered(self, numbers: Sequence[int]) -> ObjectTable:
         """The table with other numbers, one for each object."""

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import mstfilter
+from mstfilter.app.report.answer import table_cells
 from mstfilter.app.report.display import Drawing
 from mstfilter.base.errors import InputWarning
 from mstfilter.base.resources import preset_names
@@ -26,7 +27,8 @@ from mstfilter.smc import (
     linear_gaussian,
     run_many,
 )
-from tests.app.report.pages import check_html
+from tests.app.report.pages import Page, check_html
+from tests.mst.belief.test_objects import belief_of, scene, two_readings
 from tests.scene.scenes import CAMERA, table_scene
 
 MODEL = linear_gaussian(F=[[0.9]], Q=[[0.5]], H=[[1.0]], R=[[1.0]], m0=[0.0], P0=[[1.0]])
@@ -103,6 +105,24 @@ def test_text_and_html_are_short_and_complete(name):
         check_html(made)
         assert text.splitlines()[0].replace("'", "&#x27;") in made
         assert len(made) < 1_000_000
+
+
+def test_a_table_of_objects_is_a_table_with_colours():
+    table = two_readings().objects()
+    made = table._repr_html_()
+    check_html(made)
+    page = Page(made)
+    assert made.count("<tr>") == 1 + len(table) == made.count('class="chip"') + 1
+    assert repr(table).splitlines()[0] in page.text
+    for row in table_cells(table):
+        for text in row.values():
+            assert text in (made if text.startswith("#") else page.text)
+    hidden = [one for one in table if not one.visible]
+    assert page.text.count("hidden since pause 1") == len(hidden) == 1
+    assert len({row["colour"] for row in table_cells(table)}) == len(table)
+    empty = belief_of((1.0, scene())).objects()._repr_html_()
+    check_html(empty)
+    assert "0 objects" in empty and "<table" not in empty
 
 
 def test_the_texts_of_components_name_changed_fields():

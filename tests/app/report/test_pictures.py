@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+
 import numpy as np
 import pytest
 
@@ -35,6 +37,35 @@ def test_identities_follow_objects_through_relabelling_and_time(tmp_path):
             if h.n_objects == 2:
                 assert own == truth
             assert identities.colours(t, k) == {label: colour(i) for label, i in own.items()}
+
+
+def test_the_numbers_of_the_pictures_are_those_of_the_tables(tmp_path):
+    run = make_run(tmp_path / "run")
+    identities, rows = assign_identities(run), list(csv.DictReader((run.path / "objects.csv").open()))
+    assert len(rows) >= run.n_pauses
+    for t, table in enumerate(run.tables()):
+        assert [one.number for one in table] == [int(row["object"]) for row in rows if row["pause"] == str(t)]
+        for one in table:
+            assert identities.of(t, one.hypothesis)[one.label] == one.number - 1
+        given = {one.number - 1 for one in table if one.in_estimate}
+        for k in range(len(run.hypotheses(t))):
+            own = identities.of(t, k)
+            assert len(set(own.values())) == len(own)
+            if len(own) == len(given) == 2:
+                assert set(own.values()) == given
+
+
+def test_given_identities_are_kept_and_others_are_new():
+    """The same boxes with swapped identities, then a hypothesis of their own and one with a further object."""
+    from mstfilter.app.report.identities import _Assignment
+
+    book = _Assignment(9)
+    first, swapped = labels_of((1, 1, 3), (12, 12, 3)), labels_of((12, 12, 3), (1, 1, 3))
+    more = labels_of((1, 1, 3), (12, 12, 3), (6, 6, 3))
+    made = [Hypothesis.from_labels(labels, GRID) for labels in (first, swapped, more)]
+    book.add(0, made, [0.2, 0.3, 0.5], None, first, {0: {1: 7, 2: 3}})
+    assert book.table[0, 0] == {1: 7, 2: 3} and book.table[0, 1] == {1: 3, 2: 7}
+    assert book.table[0, TRUTH] == {1: 7, 2: 3} and book.table[0, 2] == {1: 7, 2: 3, 3: 9}
 
 
 def test_the_identity_of_a_moved_object_is_inherited_from_its_ancestor(tmp_path):

@@ -13,7 +13,6 @@ import pytest
 
 from mstfilter.app.report import run_report, viewpoint
 from mstfilter.app.report.answer import answers_of_run
-from mstfilter.app.report.identities import assign_identities
 from mstfilter.app.report.run_numbers import read_numbers
 from mstfilter.app.report.run_report import write_report
 from mstfilter.app.report.scenes import scenes_of_run
@@ -146,7 +145,7 @@ def test_the_first_picture_is_the_estimate(tmp_path):
     assert views[0].hypothesis.key == estimate.key and views[0].text.startswith("estimate, weight 0.33")
     assert [view.members for view in views[1:-1]] == [(k,) for k in range(3) if (k,) != views[0].members]
     identity = views[0].identity
-    shown = [one.number for one in answers_of_run(run, assign_identities(run))[0][0].table if one.in_estimate]
+    shown = [one.number for one in answers_of_run(run)[0][0].table if one.in_estimate]
     assert shown == [identity[record.label] + 1 for record in estimate.objects]
     assert "The estimate, shown by 1 of 3" in read(write_report(run))[1].text
 
