@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+import numpy as np
 
 import mstfilter
 from mstfilter import Belief
@@ -21,6 +22,7 @@ from mstfilter.app.report.answer import Answer, draw_answer
 from mstfilter.lab.simulation import PushLoop, scene_family
 from mstfilter.mst.belief import push_candidates
 
+LEAST = 0.1  # borders with probabilities nearer to 0 or 1 are left out, for a picture that is quickly read
 REACH = ((-0.5, -0.5, 0.0), (0.5, 0.5, 0.4))
 
 
@@ -51,7 +53,12 @@ def main() -> None:
     figure, axes = plt.subplots(1, len(shown), figsize=(12, 6 * height / width), layout="constrained", squeeze=False)
     for place, (image, answer) in zip(axes[0], shown, strict=True):
         print(*answer.sentences)
-        draw_answer(place, replace(answer, box=shown[0][1].box), image)
+        borders = [one for one in answer.borders if LEAST < one.one_object < 1 - LEAST]
+        draw_answer(place, replace(answer, box=shown[0][1].box, borders=borders), image)
+    for push in pushes[:1]:
+        (x, y), (u, v) = camera.project(np.array([push.contact - 0.06 * push.direction, push.contact]))[0]
+        arrow = {"arrowstyle": "-|>,head_width=0.5,head_length=0.9", "color": "#f6f6f2", "lw": 4}
+        axes[0, 0].annotate("", (u, v), (x, y), arrowprops=arrow)
     figure.savefig(options.out, dpi=100)
 
 
