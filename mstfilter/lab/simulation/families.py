@@ -257,18 +257,6 @@ SCENE_FAMILIES: dict[str, SceneFamily] = {
     "s3": replace(
         _STUDIED, name="s3", n_objects_min=15, n_objects_max=20, n_twins=4, n_stacked=4, n_hidden=3, min_moved=3
     ),
-    # What one image cannot know: one object or several in a row; and a push may hide a small object.
-    "question": replace(
-        _DEMO,
-        name="question",
-        n_twins=0,
-        n_hidden=1,
-        n_actions=3,
-        frames_per_clip=10,
-        groups="row",
-        n_groups=1,
-        push_aims="apart, nothing",
-    ),
     # Every push topples or turns an object, which shows sides that were hidden.
     "topple": replace(_S2, name="topple", min_moved=1, min_toppled=1),
 }

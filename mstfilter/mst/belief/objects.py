@@ -171,7 +171,8 @@ def object_table(belief: Belief, camera: Camera | None = None, previous: ObjectT
     if camera is not None:
         matching.keep_unseen(camera)
     rows = matching.rows
-    votes = [matching.votes(i, label) for i, label in rows]
+    kept = [matching.votes(i, label) for i, label in rows]
+    votes = list(kept)
     mass = [matching.mass] * len(rows)
     if camera is not None and rows:
         refined, weights = belief.refined_image(camera)
@@ -186,7 +187,7 @@ def object_table(belief: Belief, camera: Camera | None = None, previous: ObjectT
             # A visible and a hidden object can be compared in the kept hypotheses alone.
             a, b, w = votes[r], votes[other], mass[r]
             if w is not mass[other]:
-                a, b, w = matching.votes(i, label), matching.votes(*rows[other]), matching.mass
+                a, b, w = kept[r], kept[other], matching.mass
             if other != r and (p := a.one_with(b, w)) > _SHOWN:
                 one_with[other] = p
         objects.append(matching.described(r, votes[r], mass[r], one_with))
