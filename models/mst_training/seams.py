@@ -9,13 +9,13 @@ simulated scenes and real images. This share is no property of what is seen, so 
 scores are those for even odds: the prior is the field `one_share` of `SeamTree`.
 
 Strips are mirrored, and their colours are weakened or taken away. With `extra`, regions of labelled images join each
-batch, one object as often as several. At the end, scale and shift of the scores are fitted to the validation samples.
+batch. At the end, scale and shift of the scores are fitted to the validation samples.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -73,7 +73,7 @@ class SeamsTraining(Training):
             rng = np.random.default_rng([self.seed, 2, step])
             batch = source.batch(chosen)
             if further is not None:
-                batch = _joined(batch, further.batch(further.draw(rng, self.extra_batch)))
+                batch = _joined(batch, further.batch(rng.integers(len(further.rows), size=self.extra_batch)))
             x, strips, *others = batch
             if rng.uniform() < 0.5:
                 strips = strips.flip(3)[:, [1, 0, *range(2, len(STRIP_CHANNELS))]]
@@ -88,7 +88,7 @@ class SeamsTraining(Training):
         files = sorted(path for path in Path(self.extra).glob("*.npz") if path.stem not in without)
         if not files:
             raise InputError(f"{self.extra} has no files of samples", "an npz file of SeamSamples for each sequence")
-        return _Source.of(SeamSamples.read(files)).balanced()
+        return _Source.of(SeamSamples.read(files))
 
     def loss(
         self, networks: Mapping[str, Any], step: int, batch: Sequence[Tensor]
@@ -165,16 +165,6 @@ class _Source:
             known = one[(grouped == kind) & top]
             prior[grouped == kind] = np.log((known.sum() + 1) / ((~known).sum() + 1))
         return cls(samples, rows, prior)
-
-    def balanced(self) -> _Source:
-        """The same regions with even odds of "one", as `draw` draws them."""
-        return replace(self, prior=np.zeros(len(self.rows)))
-
-    def draw(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """Numbers (n,) of regions, half of them of one object and half of several, as far as there are both."""
-        several = self.samples.objects[[one[0] for one in self.rows]] > 1
-        kinds = [np.flatnonzero(kind) for kind in (several, ~several) if kind.any()]
-        return np.concatenate([rng.choice(part, n // len(kinds)) for part in kinds])
 
     def batch(self, chosen: np.ndarray) -> tuple[Tensor, ...]:
         """The regions with these numbers (b,), as `SeamsTraining.batches` has them."""

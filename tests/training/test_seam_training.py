@@ -66,9 +66,6 @@ def test_further_samples_join_every_batch(tmp_path):
     for *_, region, objects, prior in settings.batches(samples(1), 0, 3):
         assert len(objects) == len(prior) == settings.batch + 5 and (objects[-5:] == 3).all()
         assert region.unique().tolist() == list(range(len(objects)))
-    both = replace(settings, extra_without="", extra_batch=6)  # 3 objects or 2 in most, yet half of one
-    for *_, objects, prior in both.batches(samples(1), 0, 3):
-        assert (objects[-6:] > 1).sum() == 3 and (prior[-6:] == 0).all()
     with pytest.raises(InputError, match="no files of samples"):
         next(replace(settings, extra_without="desk, shelf").batches(samples(1), 0, 1))
 
