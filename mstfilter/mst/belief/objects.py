@@ -181,7 +181,7 @@ def object_table(belief: Belief, camera: Camera | None = None, previous: ObjectT
             if matching.is_visible(i, label) and shown.any():
                 votes[r], mass[r] = _votes(refined, shown), weights
     objects = []
-    for r, (i, label) in enumerate(rows):
+    for r in range(len(rows)):
         one_with = {}
         for other in range(len(rows)):
             # A visible and a hidden object can be compared in the kept hypotheses alone.
