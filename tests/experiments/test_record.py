@@ -6,8 +6,10 @@ import json
 import re
 import subprocess
 
+import numpy as np
 import pytest
 
+from mstfilter.base.files import read_csv
 from tests.experiments.scripts import EXPERIMENTS, import_script
 
 record = import_script("record.py")
@@ -36,13 +38,21 @@ def test_the_table_is_up_to_date():
     assert record.table() in (EXPERIMENTS / "README.md").read_text(encoding="utf-8")
 
 
-def test_figures_of_the_front_page_name_the_version_of_their_study():
-    """Each item of the results that cites a study states the commit of the record of this study."""
+def test_figures_of_the_front_page_are_those_of_the_record():
+    """The table of the results has the means of the main study, and the page links to it."""
     page = (REPOSITORY / "README.md").read_text(encoding="utf-8")
-    results = page[page.index("## Results") : page.index("## How it works")]
-    for item in re.split(r"\n(?=\d\. )", results)[1:]:
-        for name in record.cited(item):
-            assert f"commit {STUDIES[name].record()['commit']}" in " ".join(item.split()), item
+    results = page[page.index("## Results") : page.index("## What it does not do")]
+    assert "main" in record.cited(results)
+    measures = ("quality", "recalibrated_log_loss")
+    values: dict[str, list[list[float]]] = {}
+    for row in read_csv(EXPERIMENTS / "main/results/main_scenes.csv"):
+        values.setdefault(row["arm"], []).append([float(row[m]) for m in measures])
+    arms = ("mst", "single_frame", "object_fusion", "paper at its best", "floor_image")
+    shown = re.findall(r"\| (\.\d+) \| (\.\d+) \|", results)
+    assert len(shown) == len(arms)
+    for arm, figures in zip(arms, shown, strict=True):
+        np.testing.assert_allclose([float(x) for x in figures], np.mean(values[arm], axis=0), atol=6e-4, err_msg=arm)
+    assert f"{np.mean(values['true completion'], axis=0)[0]:.3f}".lstrip("0") in results
 
 
 FINGERPRINT = """
