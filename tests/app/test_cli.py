@@ -47,7 +47,7 @@ def test_run_and_report(two_pauses, tmp_path, capsys):
     assert code == 0, err
     assert "pause 1     " in out and out.count("            3 hypotheses, ESS ") == 2
     table = RunFolder.open(run).objects(1)
-    assert f"{sum(one.in_estimate for one in table)} objects." in out
+    assert f"{sum(one.visible for one in table)} objects in view." in out
     assert (run / "objects.csv").read_text().count("\n1,") == len(table)
     assert RunFolder.open(run).description["seed"] == 4
     assert not (run / "report.html").exists()

@@ -2,8 +2,8 @@
 
 >>> answer = Answer.of(belief, table, camera)
 >>> answer.sentences
-['5 objects.', '1 is hidden and remembered: 4 (.80).',
- '1 border is open: between 2 and 3 (.47 that both sides are one object).']
+['4 objects in view.', '1 is hidden and remembered: 4 (.80).',
+ '1 border is open: between objects 2 and 3 (.47 that both sides are one object).']
 >>> answer.outlines, answer.borders             # in pixels, for SVG or matplotlib
 >>> plot_answer(answer, image)                  # the picture; `Belief.plot(image, camera)` draws it too
 >>> changes(before, now)                        # what a push did, from the tables of two pauses
@@ -83,8 +83,8 @@ class OpenBorder:
     def text(self) -> str:
         """Where it is, in words."""
         if len(self.numbers) == 2:
-            return f"between {self.numbers[0]} and {self.numbers[1]}"
-        return f"within {self.numbers[0]}" if self.numbers else "beside the objects"
+            return f"between objects {self.numbers[0]} and {self.numbers[1]}"
+        return f"inside object {self.numbers[0]}" if self.numbers else "beside the objects"
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +110,7 @@ class Answer:
             thick = np.zeros(image.shape, np.uint8)
             thick[border.pixels[:, 1], border.pixels[:, 0]] = 1
             x, y = border.middle.tolist()
-            tag = tags.place(share(border.one_object), (x + 0.5, y + 0.5))
+            tag = tags.place(share(border.one_object), (x + 0.5, y + 0.5), beside=True)
             around = _polygons(_grown(thick, max(1, round(shown * camera.width / 320))))
             open_borders.append(OpenBorder(border.one_object, numbers, around, tag))
         masks = [_mask(belief, one, image, camera) for one in table]
@@ -127,9 +127,8 @@ class Answer:
     @cached_property
     def sentences(self) -> list[str]:
         """How many objects there are, what is hidden, and what is open."""
-        sure = [one for one in self.table if one.in_estimate]
-        found = [f"{_count(len(sure), 'object')}."]
         hidden = [one for one in self.table if not one.visible]
+        found = [f"{_count(len(self.table) - len(hidden), 'object')} in view."]
         if hidden:
             names = _listed([f"{one.number} ({share(one.existence)})" for one in hidden])
             found.append(f"{len(hidden)} {'is' if len(hidden) == 1 else 'are'} hidden and remembered: {names}.")
@@ -384,12 +383,13 @@ class _Tags:
         self.size, self.apart = np.array([width, height], float), apart
         self.taken: list[np.ndarray] = []
 
-    def place(self, text: str, about: Point) -> Tag:
-        """The nearest free place to a point."""
+    def place(self, text: str, about: Point, beside: bool = False) -> Tag:
+        """The nearest free place to a point, or `beside` it."""
         apart, at = self.apart, np.array(about)
         angles = np.arange(16) * np.pi / 8
         ring = np.column_stack([np.cos(angles), np.sin(angles)])
-        tried = np.concatenate([at[None], *(at + radius * apart * ring for radius in (0.8, 1.2, 1.7, 2.3))])
+        rings = [at + radius * apart * ring for radius in (0.8, 1.2, 1.7, 2.3)]
+        tried = np.concatenate(rings if beside else [at[None], *rings])
         tried = tried[((tried > apart / 3) & (tried < self.size - apart / 3)).all(axis=1)]
         free = [p for p in tried if all(np.linalg.norm((p - q) * (1, 1.4)) > apart for q in self.taken)]
         x, y = (free[0] if free else np.clip(at, apart / 3, self.size - apart / 3)).tolist()

@@ -31,9 +31,9 @@ def test_sentences_and_borders_of_two_readings():
     answer = answer_of(belief, table)
     left, right, hidden = (at(table, box).number for box in (LEFT, RIGHT, HIDDEN))
     assert answer.sentences == [
-        "4 objects.",
+        "3 objects in view.",
         f"1 is hidden and remembered: {hidden} (.60).",
-        f"1 border is open: between {left} and {right} (.25 that both sides are one object).",
+        f"1 border is open: between objects {left} and {right} (.25 that both sides are one object).",
     ]
     [border] = answer.borders
     assert border.numbers == (left, right) and border.tag.text == ".25"
@@ -72,8 +72,8 @@ def test_tags_have_room():
 
 
 def test_without_open_borders_and_without_objects():
-    assert answer_of(belief_of((1.0, scene(FAR)))).sentences == ["1 object.", "No border is open."]
-    assert answer_of(belief_of((1.0, scene()))).sentences == ["0 objects.", "No border is open."]
+    assert answer_of(belief_of((1.0, scene(FAR)))).sentences == ["1 object in view.", "No border is open."]
+    assert answer_of(belief_of((1.0, scene()))).sentences == ["0 objects in view.", "No border is open."]
 
 
 def test_parts_with_something_between_them_are_mentioned():

@@ -105,9 +105,9 @@ def test_kinds_of_runs(kind, tmp_path):
     if not kind.get("truth", True):
         assert "no ground truth" in page.text and "one blob" not in page.text and "Truth" not in page.text
     if kind.get("pauses") == 1:
-        assert "say after 1 pause · " in page.text
+        assert "say at the last of 1 pause · " in page.text
     if kind.get("empty"):
-        assert "0 objects. No border is open." in page.text
+        assert "0 objects in view. No border is open." in page.text
 
 
 @pytest.mark.nightly
