@@ -402,10 +402,16 @@ def _most(values: np.ndarray) -> bool:
 
 
 def _stored(hypothesis: Hypothesis, label: int) -> tuple[np.ndarray, np.ndarray]:
-    """Flat voxels (m,) of an object and their probabilities (m,)."""
+    """Flat voxels (m,) of an object and their probabilities (m,), which are at least .5 where it is the label."""
     voxels, owners, p = hypothesis.shares.stored
     own = (owners == label) & (p > 0)
-    return voxels[own], p[own].astype(np.float64)
+    labelled = np.flatnonzero(hypothesis.labels == label)
+    found = np.union1d(labelled, voxels[own])
+    probability = np.zeros(len(found))
+    probability[np.searchsorted(found, voxels[own])] = p[own]
+    at = np.searchsorted(found, labelled)
+    probability[at] = np.maximum(probability[at], 0.5)
+    return found, probability
 
 
 def _mean_shape(shapes: list[tuple[np.ndarray, np.ndarray]], weights: np.ndarray, shape: tuple[int, ...]) -> Crop:

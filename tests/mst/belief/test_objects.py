@@ -295,3 +295,13 @@ def test_pixels_without_depth_have_the_nearest_segment():
     assert belief.same_object_at_pixels(CAMERA, (column, row), (other, below)) == pytest.approx(0.3)
     nothing = replace(belief, seen=replace(seen, cells=np.zeros_like(cells)))
     assert nothing.segmentations is nothing.seen and Belief(belief.population).segmentations is None
+
+
+def test_an_object_without_probabilities_at_its_voxels():
+    """An occupancy of one's own may say 0 where there is a label; the label counts as one half."""
+    h = scene(FAR)
+    none = replace(h, occupancy=Occupancy(h.labels, np.zeros(h.labels.shape)))
+    [one] = belief_of((1.0, none)).objects()
+    assert one.volume == pytest.approx(180e-6) and one.shape.occupied.all()
+    assert float(one.shape.probability.max()) == 0.5
+    assert one.mesh()[1].size
