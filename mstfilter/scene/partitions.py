@@ -70,6 +70,13 @@ class CommonRefinement:
             shared[below + 1 : above + 1, 1:] = counts[1:, 1:]
         return shared
 
+    @staticmethod
+    def jaccard(shared: np.ndarray) -> np.ndarray:
+        """Intersection over union (k, k) of objects, from `overlaps`; 0 without a voxel in either."""
+        sizes = shared.diagonal()
+        union = np.add.outer(sizes, sizes) - shared
+        return np.divide(shared, union, out=np.zeros_like(shared), where=union > 0)
+
 
 def common_refinement(segmentations: Sequence[np.ndarray]) -> CommonRefinement:
     """The common refinement of n label arrays of the same shape. Labels are at least 0, and label 0 is free space."""

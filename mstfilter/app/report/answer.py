@@ -249,8 +249,8 @@ def table_cells(table: ObjectTable) -> list[dict[str, str]]:
 
 def _object_row(one: BelievedObject) -> dict[str, str]:
     """The texts of a row of the table of objects."""
-    maybe = [f"one with {k} ({share(p)})" for k, p in one.one_with.items() if p > 0.05]
-    maybe += [f"several ({share(one.several)})"] if one.several > 0.05 else []
+    maybe = [f"one with {k} ({share(p)})" for k, p in one.one_with.items() if p > _SURE]
+    maybe += [f"several ({share(one.several)})"] if one.several > _SURE else []
     moved = float(np.linalg.norm(one.pose.translation)), float(np.degrees(one.pose.rotation.magnitude()))
     volume, low, high = (f"{1e6 * v:.0f}" for v in (one.volume, *one.volume_range))
     return {

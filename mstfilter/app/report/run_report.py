@@ -20,7 +20,6 @@ import numpy as np
 from mstfilter.app.report.answer import Answer, answers_of_run, table_cells
 from mstfilter.app.report.export import mesh_bytes
 from mstfilter.app.report.figures import quality_figure, reliability_figure
-from mstfilter.app.report.identities import assign_identities
 from mstfilter.app.report.page import fill_template, flatten, note_rows, seconds_text, short_text, write_page
 from mstfilter.app.report.pictures import (
     border_colour,
@@ -72,8 +71,7 @@ def write_report(
 
 def _pauses(run: RunFolder, numbers: RunNumbers) -> list[dict[str, Any]]:
     """The answer, the image and the hypotheses of each pause, for the template."""
-    identities = assign_identities(run)
-    scenes = scenes_of_run(run, identities) if numbers.steps else []
+    scenes = scenes_of_run(run) if numbers.steps else []
     found = answers_of_run(run)
     volumes = [view.hypothesis for scene in scenes for view in scene.views]
     view = viewpoint(volumes, run.camera(0)) if scenes else None

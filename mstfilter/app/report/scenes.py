@@ -70,9 +70,9 @@ class ShownPause:
     hidden: float = 0.0  #: weight of the hypotheses that are not shown
 
 
-def scenes_of_run(run: RunFolder, identities: Identities | None = None) -> list[ShownPause]:
+def scenes_of_run(run: RunFolder) -> list[ShownPause]:
     """The pauses of a run, each with at most twelve distinct hypotheses, the estimate first, and the truth."""
-    identities = assign_identities(run) if identities is None else identities
+    identities = assign_identities(run)
     scenes: list[ShownPause] = []
     view_of: dict[int, int] = {}
     for t in range(run.n_pauses):

@@ -211,11 +211,17 @@ def _numbered(table: ObjectTable, previous: ObjectTable | None) -> ObjectTable:
 
 def _likeness(a: BelievedObject, b: BelievedObject) -> float:
     """Common share of the colours that were seen, times the root of the ratio of the volumes; 0 to 1."""
-    seen = [np.sum([v.colours for v in one.record.views if v.colours.any()], axis=0) for one in (a, b)]
-    if not all(np.ndim(colours) and len(colours) for colours in seen):
+    first, second = _colours(a.record), _colours(b.record)
+    if first is None or second is None:
         return 0.0
-    common = np.minimum(*(colours / colours.sum() for colours in seen)).sum()
+    common = np.minimum(first / first.sum(), second / second.sum()).sum()
     return float(common * np.sqrt(min(a.volume, b.volume) / max(a.volume, b.volume)))
+
+
+def _colours(record: ObjectRecord) -> np.ndarray | None:
+    """The areas of the colours that all views have seen; None if there are none."""
+    known = [view.colours for view in record.views if view.colours.any()]
+    return np.sum(known, axis=0) if known else None
 
 
 def _jaccard(a: Crop, b: Crop) -> float:
@@ -277,9 +283,7 @@ class _Matching:
         self._images: dict[int, np.ndarray] = {}
         self.refined = belief.refined_voxels
         self.shared = self.refined.overlaps()
-        sizes = self.shared.diagonal()
-        union = np.add.outer(sizes, sizes) - self.shared
-        self.jaccard = np.divide(self.shared, union, out=np.zeros_like(union), where=union > 0)
+        self.jaccard = self.refined.jaccard(self.shared)
         records = [h.objects for h in self.hypotheses]
         now = max((one.last_seen for own in records for one in own), default=0)
         self.now = now if belief.pause is None else belief.pause
@@ -371,7 +375,7 @@ class _Matching:
         order = np.argsort(volume)
         at = np.searchsorted(np.cumsum(share[order]), np.array(_RANGE) - 1e-9)
         record, (frame, sides) = self.hypotheses[i].record(label), self.hypotheses[i].box(label)
-        known = [one.colours for one in record.views if one.colours.any()]
+        colours = _colours(record)
         return BelievedObject(
             number=r,
             hypothesis=self.belief.hypotheses.index(self.hypotheses[i]),
@@ -389,7 +393,7 @@ class _Matching:
             sides=sides,
             volume=float(share @ volume),
             volume_range=(float(volume[order[at[0]]]), float(volume[order[min(at[1], len(order) - 1)]])),
-            colour=main_colour(np.sum(known, axis=0)) if known else None,
+            colour=None if colours is None else main_colour(colours),
             shape=_mean_shape(shapes, weight, grid.shape),
             origin=grid.origin,
             voxel_size=grid.voxel_size,

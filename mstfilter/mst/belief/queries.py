@@ -276,9 +276,8 @@ class Belief:
         0 if only one does.
         """
         refined, mass = self.refined_image(camera)
-        shared = refined.overlaps()
-        union = np.add.outer(shared.diagonal(), shared.diagonal()) - shared
-        jaccard = np.divide(shared, union, out=np.ones_like(shared), where=union > 0)
+        jaccard = refined.jaccard(refined.overlaps())
+        jaccard[0, 0] = 1  # neither shows an object
         rows = refined.objects
         same = sum(
             w * v * jaccard[a, b] for w, a in zip(mass, rows, strict=True) for v, b in zip(mass, rows, strict=True)

@@ -298,7 +298,7 @@ def test_pixels_without_depth_have_the_nearest_segment():
 
 
 def test_an_object_without_probabilities_at_its_voxels():
-    """An occupancy of one's own may say 0 where there is a label; the label counts as one half."""
+    """A probability of 0 where there is a label: the label counts as one half."""
     h = scene(FAR)
     none = replace(h, occupancy=Occupancy(h.labels, np.zeros(h.labels.shape)))
     [one] = belief_of((1.0, none)).objects()
