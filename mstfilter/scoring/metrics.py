@@ -185,9 +185,8 @@ def pairwise_quality(labels: Sequence[np.ndarray]) -> np.ndarray:
 
 def refined_quality(refined: CommonRefinement) -> np.ndarray:
     """`pairwise_quality` (n, n) of the n segmentations of a common refinement."""
-    common = refined.overlaps()[1:, 1:]
-    sizes = common.diagonal().copy()
-    jaccard = common / (sizes[:, None] + sizes - common)
+    shared = refined.overlaps()
+    sizes, jaccard = shared.diagonal()[1:].copy(), refined.jaccard(shared)[1:, 1:]
     objects = [slice(a, b) for a, b in pairwise(refined.first)]  # of each hypothesis
     best = np.stack([jaccard[:, k].max(axis=1, initial=0.0) for k in objects], axis=1)
     volumes = np.array([sizes[k].sum() for k in objects])

@@ -107,33 +107,24 @@ def marker_array(
         T_box_world = one.T_world_box.inv()
         corners, triangles = one.mesh()
         top = np.append(one.centre[:2], corners[:, 2].max() + _LETTERS)
-        shown = one.colour or _GREY
-        found.append(
-            kind(
-                header=header,
-                ns="objects",
-                id=one.number,
-                type=kind.TRIANGLE_LIST,
-                action=kind.ADD,
-                pose=_pose(types, T_base_world * one.T_world_box),
-                scale=types.Vector3(x=1.0, y=1.0, z=1.0),
-                color=_colour(types, shown, _VISIBLE if one.visible else _HIDDEN),
-                points=_points(types, T_box_world.apply(corners)[triangles.ravel()]),
-            )
-        )
-        found.append(
-            kind(
-                header=header,
-                ns="texts",
-                id=one.number,
-                type=kind.TEXT_VIEW_FACING,
-                action=kind.ADD,
-                pose=_pose(types, RigidTransform.from_translation(T_base_world.apply(top))),
-                scale=types.Vector3(x=0.0, y=0.0, z=_LETTERS),
-                color=_colour(types, (255, 255, 255), 1.0),
-                text=f"{one.number}: {one.existence:.2f}",
-            )
-        )
+        common = {"header": header, "id": one.number, "action": kind.ADD}
+        mesh = {
+            "ns": "objects",
+            "type": kind.TRIANGLE_LIST,
+            "pose": _pose(types, T_base_world * one.T_world_box),
+            "scale": types.Vector3(x=1.0, y=1.0, z=1.0),
+            "color": _colour(types, one.colour or _GREY, _VISIBLE if one.visible else _HIDDEN),
+            "points": _points(types, T_box_world.apply(corners)[triangles.ravel()]),
+        }
+        text = {
+            "ns": "texts",
+            "type": kind.TEXT_VIEW_FACING,
+            "pose": _pose(types, RigidTransform.from_translation(T_base_world.apply(top))),
+            "scale": types.Vector3(x=0.0, y=0.0, z=_LETTERS),
+            "color": _colour(types, (255, 255, 255), 1.0),
+            "text": f"{one.number}: {one.existence:.2f}",
+        }
+        found += [kind(**common, **mesh), kind(**common, **text)]
     return types.MarkerArray(markers=found)
 
 

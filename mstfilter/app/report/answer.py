@@ -117,8 +117,8 @@ class Answer:
         order = np.argsort([-int(mask.sum()) for mask in masks], kind="stable").tolist()
         found: dict[int, Outline] = {}
         for k in order:
-            one, at = table[k], _widest(masks[k])
-            named = None if at is None else tags.place(str(one.number), at)
+            one = table[k]
+            named = tags.place(str(one.number), widest(masks[k])[1]) if masks[k].any() else None
             around = _polygons(masks[k].astype(np.uint8), outer=True)
             found[k] = Outline(one.number, not one.visible, around, named)
         outlines = tuple(found[k] for k in range(len(table)))
@@ -365,15 +365,13 @@ def _path(polygons: Sequence[np.ndarray]) -> str:
     return "".join("M" + " ".join(f"{x:g},{y:g}" for x, y in points.tolist()) + "Z" for points in polygons)
 
 
-def _widest(mask: np.ndarray) -> Point | None:
-    """The point of a mask that is farthest from its border."""
+def widest(mask: np.ndarray) -> tuple[float, Point]:
+    """The point of a mask that is farthest from its border, after its distance in pixels. The mask is not empty."""
     from scipy.ndimage import distance_transform_edt
 
-    if not mask.any():
-        return None
     inside = distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
     row, column = np.unravel_index(int(inside.argmax()), mask.shape)
-    return float(column) + 0.5, float(row) + 0.5
+    return float(inside[row, column]), (float(column) + 0.5, float(row) + 0.5)
 
 
 class _Tags:

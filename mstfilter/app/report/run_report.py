@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.app.report.answer import Answer, answers_of_run, table_cells
+from mstfilter.app.report.answer import Answer, answers_of_run, table_cells, widest
 from mstfilter.app.report.export import mesh_bytes
 from mstfilter.app.report.figures import quality_figure, reliability_figure
 from mstfilter.app.report.page import fill_template, flatten, note_rows, seconds_text, short_text, write_page
@@ -137,21 +137,20 @@ def _card(one: ShownHypothesis, camera: Camera, view: Camera, n: int) -> dict[st
 
 def _place_tags(image: np.ndarray, identity: Mapping[int, int]) -> list[dict[str, Any]]:
     """Number and position (at the widest part) of each object that is large enough in the image, largest first."""
-    from scipy.ndimage import distance_transform_edt, find_objects
+    from scipy.ndimage import find_objects
 
     min_radius, min_distance = 0.009 * image.shape[1], 0.03 * image.shape[1]
     places = []
     for label, box in enumerate(find_objects(image.astype(np.int32)), 1):
         if box is None or label not in identity:
             continue
-        inside = distance_transform_edt(np.pad(image[box] == label, 1))[1:-1, 1:-1]
-        row, column = np.unravel_index(int(inside.argmax()), inside.shape)
-        places.append((float(inside[row, column]), label, float(column + box[1].start), float(row + box[0].start)))
+        radius, (x, y) = widest(image[box] == label)
+        places.append((radius, label, x + box[1].start, y + box[0].start))
     tags: list[dict[str, Any]] = []
     for radius, label, x, y in sorted(places, reverse=True):
-        apart = all(np.hypot(tag["x"] - 0.5 - x, tag["y"] - 0.5 - y) > min_distance for tag in tags)
+        apart = all(np.hypot(tag["x"] - x, tag["y"] - y) > min_distance for tag in tags)
         if radius >= min_radius and apart:
-            tags.append({"text": str(identity[label] + 1), "x": x + 0.5, "y": y + 0.5})
+            tags.append({"text": str(identity[label] + 1), "x": x, "y": y})
     return tags
 
 
