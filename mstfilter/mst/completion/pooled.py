@@ -24,7 +24,7 @@ from mstfilter.scene import Recording, UsesFiles
 class Pooled(OnLattice, UsesFiles):
     """The weighted mean of the probabilities of several completers (a linear opinion pool).
 
-    A mean is right if one of the completers knows better and nobody can tell which: a voxel gets a probability near 0
+    A mean is right if one of the completers knows better and we cannot tell which: a voxel gets a probability near 0
     or 1 only if all of them agree. On meshes of the tuning pool it has a lower log loss than the mean of log odds,
     and weights of .3 to .5 for the network differ little.
 
