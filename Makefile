@@ -2,13 +2,14 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-STAMP := $(VENV)/.installed
+CORE := $(VENV)/.installed
+STAMP := $(VENV)/.installed-dev
 
 .PHONY: demo test nightly lint docs dist clean
 
-demo: $(STAMP)
+demo: $(CORE)
 	rm -rf demo
-	$(BIN)/mstfilter demo --out demo
+	PYTHONDONTWRITEBYTECODE= $(BIN)/mstfilter demo --out demo
 
 PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
 
@@ -30,15 +31,22 @@ docs: $(STAMP)
 
 dist: $(STAMP)
 	rm -rf dist
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[release]'
+	$(PIP) -e '.[release]'
 	$(BIN)/python -m build
 	$(BIN)/python -m twine check --strict dist/*
 
-$(STAMP): pyproject.toml constraints.txt
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+
+# The demo needs what a user needs, and is there sooner. Modules are compiled when they are first imported.
+$(CORE): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "error: $(PYTHON) is missing or older than 3.11; hint: make PYTHON=python3.12 ..."; exit 2; }
 	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || { echo "error: $(PYTHON) has no venv module; hint: apt install python3-venv"; exit 2; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(PIP) --no-compile -e .
+	@touch $@
+
+$(STAMP): $(CORE)
+	$(PIP) --no-compile -e '.[dev]'
 	@touch $@
 
 clean:

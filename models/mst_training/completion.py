@@ -6,12 +6,17 @@ The loss is the log loss of the voxels that are not observed as free. The log lo
 number of voxels on or behind the visible surface, so that small objects count as much as large ones. The divisor
 depends on the input only, so the loss stays proper. At the end, scale and shift of the logits are fitted to the
 validation samples, over the voxels that are not free.
+
+Some batches have crops of 48 or 64 voxels, so that the network knows them too. With ``objects=FOLDER``, half of the
+objects are meshes of the folder's training pool (`mstfilter.lab.simulation.objects`). Those of the validation are of
+the tuning pool; the test has none.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -19,11 +24,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mst_training.completion_data import MASK_KINDS, CompletionSamples
+from mst_training.completion_data import MASK_KINDS, CompletionSamples, LargeSamples
 from mst_training.loop import Training, fit_calibration
-from mst_training.scenes import Samples
+from mst_training.scenes import Clutter, Samples
 from mst_training.shapes import HELD_OUT
-from mstfilter.mst.completion.crops import CHANNELS, LATTICE, channels, extruded
+from mstfilter.mst.completion.crops import CHANNELS, EDGE, LARGER, LATTICE, channels, extruded
 from mstfilter.mst.completion.unet import ARCHITECTURE, CompletionNet
 from mstfilter.scene import Seen
 from mstfilter.scoring.forecasts import ForecastTable
@@ -36,12 +41,15 @@ class CompletionTraining(Training):
     """Settings of the training of the completion network. A scene gives about 35 samples."""
 
     n_globals: int = 16  #: number of global features
+    objects: str = ""  #: folder of meshes; none if empty
+    n_large: int = 200  #: further scenes for training, with larger objects
+    large: float = 0.2  #: share of the batches with crops of larger objects; they have as many voxels as others
 
     recipes: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "cpu": {},
         "gpu": {"n_scenes": 9000, "width": 32, "steps": 200_000, "batch": 64},
         "smoke": {
-            **{"n_scenes": 6, "n_validation": 2, "n_test": 3},
+            **{"n_scenes": 6, "n_validation": 2, "n_test": 3, "n_large": 2},
             **{"width": 8, "n_globals": 4, "steps": 150, "average": 0.97},
         },
     }
@@ -52,13 +60,43 @@ class CompletionTraining(Training):
     def networks(self) -> dict[str, nn.Module]:
         return {"net": CompletionNet(len(CHANNELS), self.width, self.n_globals)}
 
-    def batches(self, samples: CompletionSamples, first: int, last: int) -> Iterator[tuple[Tensor, ...]]:
-        """Batches in which each sample is turned and mirrored."""
-        for step, chosen in self.order(len(samples), first, last):
-            turns = np.random.default_rng([self.seed, 2, step]).integers(8, size=self.batch)
+    def clutter(self, part: str) -> Clutter:
+        usual = super().clutter(part)
+        if part == "test" or not self.objects:
+            return usual
+        return replace(usual, objects=self.objects, pool="training" if part == "train" else "tuning")
+
+    def make_samples(self, folder: Path, workers: int) -> dict[str, list[Path]]:
+        files = super().make_samples(folder, workers)
+        clutter = replace(self.clutter("train"), sizes=LargeSamples.clutter.sizes)
+        files["large"] = LargeSamples.write(folder / "large", self.seed, self.n_large, workers, clutter)
+        return files
+
+    def read_training(self, files: Mapping[str, Sequence[Path]]) -> tuple[CompletionSamples, LargeSamples | None]:
+        return CompletionSamples.read(files["train"]), LargeSamples.read(files["large"]) if files["large"] else None
+
+    def batches(
+        self, samples: tuple[CompletionSamples, LargeSamples | None], first: int, last: int
+    ) -> Iterator[tuple[Tensor, ...]]:
+        """Batches in which each sample is turned and mirrored. All samples of a batch have crops of one size."""
+        usual, larger = samples
+        sizes = _extents(larger.bits) if larger is not None else np.zeros(0, np.int64)
+        for step, chosen in self.order(len(usual), first, last):
+            rng = np.random.default_rng([self.seed, 2, step])
+            of: CompletionSamples = usual
+            edge = EDGE
+            if larger is not None and rng.uniform() < self.large:
+                edge = int(rng.choice(LARGER))
+                n = max(self.batch * EDGE**3 // edge**3, 1)
+                if (fits := np.flatnonzero(sizes <= edge)).size:
+                    of, chosen = larger, rng.choice(fits, n)
+                else:
+                    edge = EDGE
+            cut = (slice(edge),) * 3
+            turns = rng.integers(8, size=len(chosen))
             columns = (
-                [_turned(values[i], t) for i, t in zip(chosen, turns, strict=True)]
-                for values in (samples.bits, samples.signed, samples.truth)
+                [_turned(values[i][cut], t) for i, t in zip(chosen, turns, strict=True)]
+                for values in (of.bits, of.signed, of.truth)
             )
             yield tuple(torch.from_numpy(np.stack(column)) for column in columns)
 
@@ -67,7 +105,7 @@ class CompletionTraining(Training):
     ) -> tuple[Tensor, tuple[float, ...]]:
         """Log loss a voxel on or behind the surface."""
         bits, signed, truth = batch
-        x = channels(bits, signed, _heights()).to(bits.device)
+        x = channels(bits, signed, _heights(bits)).to(bits.device)
         with torch.autocast(x.device.type, dtype=torch.bfloat16, enabled=self.half_precision):
             logits = networks["net"](x)
         unknown, own = ~Seen.FREE.among(bits), _OWN.among(bits).sum(dim=(1, 2, 3))
@@ -96,8 +134,15 @@ class CompletionTraining(Training):
         return described, figures, rows
 
 
-def _heights() -> Tensor:
-    return (torch.arange(32) + 0.5) * LATTICE
+def _heights(bits: Tensor) -> Tensor:
+    return (torch.arange(bits.shape[-1]) + 0.5) * LATTICE
+
+
+def _extents(bits: np.ndarray) -> np.ndarray:
+    """The largest extent (n,) of the used part of crops (n, e, e, e) that are padded with zeros."""
+    used = [bits.any(axis=tuple(a for a in (1, 2, 3) if a != axis)) for axis in (1, 2, 3)]
+    edge = bits.shape[-1]
+    return np.max([edge - one[:, ::-1].argmax(axis=1) for one in used], axis=0)
 
 
 def _turned(values: np.ndarray, symmetry: int) -> np.ndarray:
@@ -112,7 +157,7 @@ def _logits(net: CompletionNet, samples: CompletionSamples, device: torch.device
         for start in range(0, len(samples), 32):
             part = slice(start, min(start + 32, len(samples)))
             bits, signed = torch.from_numpy(samples.bits[part]), torch.from_numpy(samples.signed[part])
-            yield part, net(channels(bits, signed, _heights()).to(device)).cpu()
+            yield part, net(channels(bits, signed, _heights(bits)).to(device)).cpu()
 
 
 def evaluate(net: CompletionNet, samples: CompletionSamples, device: torch.device) -> dict[str, float]:

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mst_training.scenes import Samples
+from mst_training.scenes import Clutter, Samples
 from mst_training.shapes import HELD_OUT, TRAINED
 from mstfilter.base.errors import InputError, check_choice
 from mstfilter.base.files import atomic_path, read_csv, write_csv, write_text
@@ -77,6 +77,24 @@ class Training(ABC):
             except (ValueError, KeyError):
                 raise InputError(f"setting {name} is {value!r}, expected {kind.__name__}") from None
         return replace(settings, **changes)
+
+    def clutter(self, part: str) -> Clutter:
+        """What the scenes of the training, validation or test (``part``) look like."""
+        usual = self.samples.clutter
+        return replace(usual, kinds=TRAINED + HELD_OUT) if part == "test" else usual
+
+    def make_samples(self, folder: Path, workers: int) -> dict[str, list[Path]]:
+        """Files with samples for validation, test and training; those that exist are kept."""
+        counts = {"validation": self.n_validation, "test": self.n_test, "train": self.n_scenes}
+        seeds = {"validation": self.seed + 1, "test": self.seed + 2, "train": self.seed}
+        return {
+            part: self.samples.write(folder / part, seeds[part], n, workers, self.clutter(part))
+            for part, n in counts.items()
+        }
+
+    def read_training(self, files: Mapping[str, Sequence[Path]]) -> Any:
+        """The samples for the training, as `batches` expects them."""
+        return self.samples.read(files["train"])
 
     @abstractmethod
     def networks(self) -> dict[str, nn.Module]:
@@ -147,18 +165,12 @@ def run_training(
     if (folder / DESCRIPTION).is_file():  # it is finished
         return dict(open_model(str(folder), settings.architecture).description["test"])
     report(0, settings.steps, "making samples")
-    seed, place = settings.seed, folder / "samples"
-    make, read = settings.samples.write, settings.samples.read
-    parts = {
-        "validation": make(place / "validation", seed + 1, settings.n_validation, workers, TRAINED),
-        "test": make(place / "test", seed + 2, settings.n_test, workers, TRAINED + HELD_OUT),
-        "train": make(place / "train", seed, settings.n_scenes, workers, TRAINED),
-    }
+    parts, read = settings.make_samples(folder / "samples", workers), settings.samples.read
     run = _Run(settings, folder, torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu")))
     validation = read(parts["validation"])
     if run.step < settings.steps:
         last = settings.steps if max_steps is None else min(settings.steps, run.step + max_steps)
-        run.train(read(parts["train"]), validation, last, report)
+        run.train(settings.read_training(parts), validation, last, report)
         if run.step < settings.steps:
             return None
     described, figures, rows = settings.finish(run.averaged, validation, read(parts["test"]), run.device)

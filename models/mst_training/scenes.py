@@ -1,6 +1,6 @@
 """What the generators of training samples share: clutter at rest under physics, its cameras, and files of samples.
 
->>> world = draw_scene(np.random.default_rng(0), TRAINED)
+>>> world = Clutter().draw(np.random.default_rng(0))
 >>> camera = draw_camera(rng, (0, 0), elevation=(22, 68), distance=(0.55, 1.05))
 >>> View.of(world, camera).instance
 >>> CompletionSamples.write(folder, seed=0, n_scenes=1000, workers=2)      # resumable
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -23,53 +23,87 @@ from mstfilter.base.errors import InputError
 from mstfilter.base.files import atomic_path
 from mstfilter.base.processes import environment
 from mstfilter.base.reading import MAX_WEIGHTS, read_arrays
-from mstfilter.lab.simulation.arrangement import SceneObjects, arrange_objects
+from mstfilter.lab.simulation.arrangement import SceneObjects, arrange_objects, draw_wall
 from mstfilter.lab.simulation.families import SceneFamily
+from mstfilter.lab.simulation.objects import MeshPool, open_objects
+from mstfilter.lab.simulation.shapes import Shape
 from mstfilter.lab.simulation.world import PhysicsWorld
 from mstfilter.scene import Camera, look_at, scene_cache
 
 WIDTH, HEIGHT = 320, 240  # pixels of an image
+_LONGEST = 0.45  # longest side to which a mesh is enlarged, metres
 
 
-def draw_scene(rng: np.random.Generator, kinds: tuple[str, ...], largest: float = 1.0) -> PhysicsWorld | None:
-    """Draw a scene of 2 to 12 objects of some kinds, at rest; None if the objects do not fit.
+@dataclass(frozen=True)
+class Clutter:
+    """What the scenes of a training look like: 2 to 12 objects, at rest under physics."""
 
-    The objects of half of the scenes are larger, by one factor of up to `largest`.
-    """
-    n = int(rng.integers(2, 13))
-    scale = largest ** rng.uniform() if largest > 1 and rng.uniform() < 0.5 else 1.0
-    shapes = [draw_training_shape(rng, draw_kind(rng, kinds), scale) for _ in range(n)]
-    world = PhysicsWorld(shapes, arm=False)
-    n_dropped = int(rng.integers(0, n // 2 + 1)) if rng.uniform() < 0.6 else 0
-    family = SceneFamily(
-        name="training",
-        n_objects_min=n,
-        n_objects_max=n,
-        n_twins=0,
-        contact=float(rng.uniform(0.3, 1.0)),
-        n_actions=0,
-    )
-    order = rng.permutation(n)
-    try:
-        # Dropped objects start far away; the others are arranged first.
-        first = PhysicsWorld([shapes[k] for k in order[n_dropped:]], arm=False)
-        arrange_objects(rng, first, replace(family, n_objects_min=n - n_dropped), SceneObjects(first.shapes))
-    except InputError:
-        return None
-    for k, position, rotation in zip(order[n_dropped:].tolist(), first.positions(), first.rotations(), strict=True):
-        world.place(k, position, rotation)
-    world.forward()
-    for k in order[:n_dropped].tolist():
-        near = world.positions()[order[n_dropped:]]
-        at = near[int(rng.integers(len(near))), :2] + rng.normal(0.0, 0.03, 2)
-        world.place(k, (*at, 0.12 + shapes[k].radius + rng.uniform(0.0, 0.1)), Rotation.random(rng=rng).as_matrix())
+    kinds: tuple[str, ...] = TRAINED  #: generated shapes (`mst_training.shapes`)
+    objects: str = ""  #: folder of meshes (`open_objects`); none if empty
+    pool: MeshPool = "training"
+    #: Range of the factor by which the objects of a scene are larger than drawn. Above 1, half of the scenes whose
+    #: range starts at 1 are not larger.
+    sizes: tuple[float, float] = (1.0, 1.0)
+    walls: float = 0.0  #: share of the scenes with a wall behind or beside the objects
+    alike: float = 0.0  #: share of the scenes in which several objects have the same shape, and all touch
+
+    def draw(self, rng: np.random.Generator) -> PhysicsWorld | None:
+        """Draw a scene; None if the objects do not fit."""
+        least, largest = self.sizes
+        n = int(rng.integers(2, 13 if least <= 1 else 7))
+        larger = least > 1 or (largest > 1 and rng.uniform() < 0.5)
+        scale = least * (largest / least) ** rng.uniform() if larger else 1.0
+        share = float(rng.uniform()) if self.objects else 0.0
+        shapes = [self._shape(rng, scale, share) for _ in range(n)]
+        alike = self.alike > 0 and rng.uniform() < self.alike
+        if alike:
+            some = int(rng.integers(1, 4))
+            shapes = [shapes[k % some] for k in range(n)]
+        wall = draw_wall(rng) if self.walls and rng.uniform() < self.walls else None
+        world = PhysicsWorld(shapes, arm=False, wall=wall)
+        n_dropped = int(rng.integers(0, n // 2 + 1)) if rng.uniform() < 0.6 else 0
+        family = SceneFamily(
+            name="training",
+            n_objects_min=n - n_dropped,
+            n_objects_max=n,
+            n_twins=0,
+            contact=1.0 if alike else float(rng.uniform(0.3, 1.0)),
+            n_actions=0,
+        )
+        order = rng.permutation(n)
+        try:
+            # Dropped objects start far away; the others are arranged first.
+            first = PhysicsWorld([shapes[k] for k in order[n_dropped:]], arm=False, wall=wall)
+            arrange_objects(rng, first, family, SceneObjects(first.shapes, wall=wall))
+        except InputError:
+            return None
+        placed = zip(order[n_dropped:].tolist(), first.positions(), first.rotations(), strict=True)
+        for k, position, rotation in placed:
+            world.place(k, position, rotation)
         world.forward()
-        if not world.overlaps(k):
-            world.settle()
-        else:
-            put_away(world, k)
-    world.forward()
-    return world
+        for k in order[:n_dropped].tolist():
+            near = world.positions()[order[n_dropped:]]
+            at = near[int(rng.integers(len(near))), :2] + rng.normal(0.0, 0.03, 2)
+            above = 0.12 + shapes[k].radius + rng.uniform(0.0, 0.1)
+            world.place(k, (*at, above), Rotation.random(rng=rng).as_matrix())
+            world.forward()
+            if not world.overlaps(k):
+                world.settle()
+            else:
+                put_away(world, k)
+        world.forward()
+        return world
+
+    def _shape(self, rng: np.random.Generator, scale: float, share: float) -> Shape:
+        """A mesh with probability `share`, or a generated shape."""
+        if not share or rng.uniform() >= share:
+            return draw_training_shape(rng, draw_kind(rng, self.kinds), scale)
+        drawn = open_objects(self.objects).draw(rng, self.pool)
+        scale = min(scale, max(_LONGEST / (2 * float(drawn.half.max())), 1.0))
+        assert drawn.surface is not None
+        size = drawn.scale * scale
+        mass = drawn.mass * scale**3
+        return Shape.of_surface(drawn.surface, size, drawn.family, drawn.name, mass, drawn.finish)
 
 
 def put_away(world: PhysicsWorld, k: int) -> None:
@@ -150,7 +184,7 @@ class Samples:
     """
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
-    largest: ClassVar[float] = 1.0  #: largest factor of the sizes of objects (`draw_scene`)
+    clutter: ClassVar[Clutter] = Clutter()
 
     @classmethod
     def of_world(cls, rng: np.random.Generator, world: PhysicsWorld, index: int) -> Self | None:
@@ -158,15 +192,16 @@ class Samples:
         raise NotImplementedError
 
     @classmethod
-    def of_scene(cls, seed: int, index: int, kinds: tuple[str, ...] = TRAINED) -> Self:
+    def of_scene(cls, seed: int, index: int, clutter: Clutter | None = None) -> Self:
         """The samples of scene number `index`, which follow from the arguments alone."""
+        clutter = clutter or cls.clutter
         for attempt in range(20):
             rng = np.random.default_rng([seed, index, attempt])
-            world = draw_scene(rng, kinds, cls.largest)
+            world = clutter.draw(rng)
             samples = None if world is None else cls.of_world(rng, world, index)
             if samples is not None:
                 return samples
-        raise InputError(f"no scene could be made of the kinds {', '.join(kinds)}")
+        raise InputError(f"no scene could be made of {clutter}")
 
     @classmethod
     def write(
@@ -175,7 +210,7 @@ class Samples:
         seed: int,
         n_scenes: int,
         workers: int = 1,
-        kinds: tuple[str, ...] = TRAINED,
+        clutter: Clutter | None = None,
         per_file: int = 10,
     ) -> list[Path]:
         """Write the samples of scenes 0 .. n - 1 to files of a folder; existing files are kept.
@@ -188,7 +223,7 @@ class Samples:
                 cls,
                 seed,
                 range(start, min(start + per_file, n_scenes)),
-                kinds,
+                clutter,
             )
             for start in range(0, n_scenes, per_file)
         ]
@@ -213,7 +248,7 @@ class Samples:
 
     def columns(self) -> dict[str, np.ndarray]:
         """The arrays by name."""
-        return {name: getattr(self, name) for name in self.__dataclass_fields__}
+        return {one.name: getattr(self, one.name) for one in fields(self)}
 
     def __len__(self) -> int:
         return len(next(iter(self.columns().values())))
@@ -225,12 +260,12 @@ class Samples:
     @classmethod
     def join(cls, parts: Sequence[Self]) -> Self:
         """All samples of several parts."""
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
+        return cls(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(cls)))
 
 
-def _write_file(job: tuple[Path, type[Samples], int, range, tuple[str, ...]]) -> None:
-    path, samples, seed, scenes, kinds = job
+def _write_file(job: tuple[Path, type[Samples], int, range, Clutter | None]) -> None:
+    path, samples, seed, scenes, clutter = job
     if not path.exists():
-        made = samples.join([samples.of_scene(seed, k, kinds) for k in scenes])
+        made = samples.join([samples.of_scene(seed, k, clutter) for k in scenes])
         scene_cache.clear()
         made.save(path)

@@ -21,8 +21,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from mst_training.scenes import Samples, displaced
-from mst_training.shapes import TRAINED
+from mst_training.scenes import Clutter, Samples, displaced
 from mstfilter.base.errors import InputError
 from mstfilter.lab.simulation import scene_family
 from mstfilter.lab.simulation.recorder import POSE_TOLERANCE, SimulatedScene
@@ -63,8 +62,8 @@ class SeamSamples(Samples):
     grouped: np.ndarray  #: (k,) bool, whether the scene has groups
 
     @classmethod
-    def of_scene(cls, seed: int, index: int, kinds: tuple[str, ...] = TRAINED) -> Self:
-        """The samples of scene number `index`; `kinds` are not used."""
+    def of_scene(cls, seed: int, index: int, clutter: Clutter | None = None) -> Self:
+        """The samples of scene number `index`; `clutter` is not used."""
         for attempt in range(20):
             rng = np.random.default_rng([seed, index, attempt])
             try:

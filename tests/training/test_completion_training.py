@@ -9,16 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from mst_training import completion_data
 from mst_training.completion import CompletionTraining
-from mst_training.completion_data import CompletionSamples
+from mst_training.completion_data import CompletionSamples, LargeSamples
 from mst_training.loop import run_training
-from mst_training.scenes import draw_camera, draw_scene
-from mst_training.shapes import HELD_OUT, TRAINED, draw_training_shape
+from mst_training.scenes import Clutter, draw_camera
+from mst_training.shapes import HELD_OUT, THIN, TRAINED, draw_training_shape
 from mstfilter.base.errors import InputError
 from mstfilter.base.files import read_csv
 from mstfilter.base.trained import open_model, write_model
+from mstfilter.lab.simulation.sensor import DepthSensor
 from mstfilter.lab.simulation.shapes import label_voxels
 from mstfilter.mst.completion import NetworkCompleter
 from mstfilter.mst.completion.crops import extruded
@@ -28,7 +30,7 @@ from tests.mst.completion.test_completion import masks_of
 from tests.mst.segmentation.scenes import GRID, TWO, frame_of
 
 SMALL = CompletionTraining(
-    n_scenes=1, n_validation=1, n_test=1, width=8, n_globals=4, steps=40, batch=8, rate=4e-3, average=0.9
+    n_scenes=1, n_validation=1, n_test=1, n_large=0, width=8, n_globals=4, steps=40, batch=8, rate=4e-3, average=0.9
 )
 
 
@@ -71,6 +73,70 @@ def test_parts_of_an_object_share_its_voxels(samples):
     assert volume[samples.mask == 1].mean() < volume[samples.mask == 0].mean()
 
 
+def test_larger_objects_are_whole_and_in_batches_of_their_own(samples):
+    """Crops of 48 and 64 voxels; a batch of them has about as many voxels as one of 32."""
+    large = LargeSamples.of_scene(0, 0)
+    assert large.bits.shape[1:] == (64,) * 3 and len(large) > 3
+    extents = [np.ptp(np.argwhere(bits), axis=0).max() + 1 for bits in large.bits]
+    assert min(extents) > 32
+    steps = 40
+    settings = replace(SMALL, large=0.5, batch=16, steps=steps)
+    counts: dict[int, int] = {}
+    for bits, signed, truth in settings.batches((samples, large), 0, steps):
+        n, edge = bits.shape[:2]
+        assert bits.shape == signed.shape == truth.shape == (n, *(edge,) * 3)
+        assert n == {32: 16, 48: 4, 64: 2}[edge]
+        counts[edge] = counts.get(edge, 0) + 1
+        if edge == 64:  # whole crops, turned about the vertical
+            found = bits.numpy().sum(axis=(1, 2, 3))
+            assert np.isin(found, large.bits.sum(axis=(1, 2, 3))).all()
+    assert 10 <= counts[32] <= 30 and counts[64] >= 3  # of 40, false alarms below .002
+    assert (48 in counts) == (min(extents) <= 48)
+
+
+def test_meshes_are_among_the_objects(tmp_path, monkeypatch):
+    """Of the pool that is named, with their true size and shape, beside generated ones."""
+    monkeypatch.setenv("MSTFILTER_CACHE", str(tmp_path / "cache"))
+    (tmp_path / "mine").mkdir()
+    for name, size in (("brick", (0.10, 0.06, 0.05)), ("plank", (0.16, 0.05, 0.02))):
+        trimesh.creation.box(size).export(tmp_path / "mine" / f"{name}.ply")
+    clutter = Clutter(objects=str(tmp_path / "mine"), pool="all", sizes=(1.0, 1.5))
+    found = []
+    for k in range(6):
+        world = clutter.draw(np.random.default_rng([1, k]))
+        found += [] if world is None else [*world.shapes]
+    meshes = [shape for shape in found if shape.surface is not None]
+    assert 0.2 < len(meshes) / len(found) < 0.8
+    for shape in meshes:
+        assert shape.name in ("brick", "plank") and shape.half.max() <= 0.225
+        factor = shape.half / np.sort({"brick": (0.05, 0.03, 0.025), "plank": (0.08, 0.025, 0.01)}[shape.name])[::-1]
+        assert np.ptp(factor) < 0.02 and 0.999 <= factor[0] <= 1.501
+    training = CompletionTraining(objects="folder")
+    assert [training.clutter(part).objects for part in ("train", "validation", "test")] == ["folder", "folder", ""]
+    assert [training.clutter(part).pool for part in ("train", "validation")] == ["training", "tuning"]
+
+
+def test_scenes_with_equal_objects_and_with_a_wall():
+    alike, plain = (Clutter(alike=share).draw(np.random.default_rng(3)) for share in (1.0, 0.0))
+    assert alike is not None and plain is not None
+    assert len({id(shape) for shape in alike.shapes}) <= 3 < len({id(shape) for shape in plain.shapes})
+    walled = Clutter(walls=1.0).draw(np.random.default_rng(3))
+    assert walled is not None and walled.model.ngeom == plain.model.ngeom + 1
+
+
+@pytest.mark.parametrize("kind", THIN)
+def test_a_thin_wall_has_no_holes(kind):
+    """The voxels of a thin-walled shape are about its volume, and one more layer than needed at most."""
+    for k in range(3):
+        shape = draw_training_shape(np.random.default_rng(k), kind)
+        poses = np.eye(4)[None].copy()
+        poses[0, :3, 3] = 0.003, 0.002, shape.half[2] + 0.001
+        centres, filled = (label_voxels([shape], poses, completion_data._GRID, thin) > 0 for thin in ((), (0,)))
+        assert (centres <= filled).all()
+        volume = sum(piece.volume for piece in shape.pieces)  # pieces overlap a little
+        assert filled.sum() * 1e-6 < 2.2 * volume + 2e-5
+
+
 @pytest.mark.parametrize("kind", [*TRAINED, *HELD_OUT])
 def test_shapes(kind):
     """Centred on the origin, of a size that fits a table; every drawn size differs."""
@@ -84,15 +150,15 @@ def test_shapes(kind):
 
 def test_earlier_views_are_evidence_about_the_object():
     """The same masks with and without them: more is known, and nearly all of it is true."""
-    world = draw_scene(np.random.default_rng([3, 0, 0]), TRAINED)
+    world = Clutter().draw(np.random.default_rng([3, 0, 0]))
     assert world is not None
     rng = np.random.default_rng(1)
     camera = draw_camera(rng, world.poses()[:, :2, 3].mean(axis=0), (22, 68), (0.55, 1.05))
-    frame, instance = completion_data._frame(rng, world, camera)
+    frame, instance = completion_data._frame(rng, world, camera, DepthSensor())
     truth = label_voxels(world.shapes, world.poses(), completion_data._GRID)
     frames = []
     while len(frames) < 3:
-        frames += completion_data._earlier_frames(rng, world)
+        frames += completion_data._earlier_frames(rng, world, DepthSensor())
     compared = 0
     for k in np.unique(instance[instance > 0]):
         samples = [
@@ -168,7 +234,7 @@ def test_settings():
 def test_steps_on_a_batch_lower_its_loss(samples):
     torch.manual_seed(0)
     settings = replace(SMALL, half_precision=False)
-    networks, (batch,) = settings.networks(), settings.batches(samples, 0, 1)
+    networks, (batch,) = settings.networks(), settings.batches((samples, None), 0, 1)
     optimiser, losses = torch.optim.AdamW(networks["net"].parameters(), lr=1e-2), []
     for step in range(8):
         total, figures = settings.loss(networks, step, batch)

@@ -14,6 +14,7 @@ The report, the console and notebooks show the same picture and the same words. 
 
 from __future__ import annotations
 
+from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -26,6 +27,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Polygon
 
 from mstfilter.app.report.charts import Drawing
+from mstfilter.app.report.export import mesh_bytes
 from mstfilter.app.report.pictures import border_colour, close_up, colour, hexadecimal
 from mstfilter.mst.belief import Belief, BelievedObject, Border, ObjectTable
 from mstfilter.runs import RunFolder
@@ -242,9 +244,32 @@ def _shift(before: BelievedObject, now: BelievedObject) -> float:
     return float(np.linalg.norm(now.centre - before.centre))
 
 
+#: The columns of the table of objects: keys of `table_cells`, and their heads.
+TABLE_COLUMNS = {
+    "number": "object",
+    "exists": "exists",
+    "seen": "seen",
+    "middle": "middle, cm",
+    "spread": "± cm",
+    "size": "size, cm",
+    "volume": "volume, cm³",
+    "range": "80 % range",
+    "moved": "moved",
+    "maybe": "perhaps",
+}
+
+
 def table_cells(table: ObjectTable) -> list[dict[str, str]]:
     """The table of objects as a person reads it: the texts of a row for each object, in the order of the numbers."""
     return [_object_row(one) for one in sorted(table, key=lambda one: one.number)]
+
+
+def mesh_link(table: ObjectTable) -> str:
+    """The smooth objects of a table as a data URI of a .glb file; empty if there are none."""
+    if not len(table):
+        return ""
+    data = mesh_bytes(table, "glb", {one.number: colour(one.number - 1) for one in table})
+    return f"data:model/gltf-binary;base64,{b64encode(data).decode()}"
 
 
 def _object_row(one: BelievedObject) -> dict[str, str]:

@@ -10,15 +10,13 @@ cannot access the rest of the page. A repeated run gives an identical file, exce
 
 from __future__ import annotations
 
-from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mstfilter.app.report.answer import Answer, answers_of_run, table_cells, widest
-from mstfilter.app.report.export import mesh_bytes
+from mstfilter.app.report.answer import TABLE_COLUMNS, Answer, answers_of_run, mesh_link, table_cells, widest
 from mstfilter.app.report.figures import quality_figure, reliability_figure
 from mstfilter.app.report.page import fill_template, flatten, note_rows, seconds_text, short_text, write_page
 from mstfilter.app.report.pictures import (
@@ -33,7 +31,6 @@ from mstfilter.app.report.pictures import (
 from mstfilter.app.report.run_numbers import SLOT_TITLES, RunNumbers, read_numbers
 from mstfilter.app.report.scenes import ShownHypothesis, ShownPause, scenes_of_run
 from mstfilter.app.report.viewer import run_page
-from mstfilter.mst.belief import ObjectTable
 from mstfilter.runs import RunFolder
 from mstfilter.scene import Camera, Hypothesis, project
 from mstfilter.scoring import forecast_table
@@ -56,22 +53,23 @@ def write_report(
         "seconds": seconds_text,
         "percent": lambda x: f"{100 * x:.3g} %",
     }
+    scenes = scenes_of_run(run) if numbers.steps else []
     page = fill_template(
         "report.html",
         filters,
         run=numbers,
-        pauses=_pauses(run, numbers),
+        pauses=_pauses(run, numbers, scenes),
+        columns=TABLE_COLUMNS,
         figures=_figures(numbers),
-        rotatable=Markup(run_page(run, photos=False, head=False).frame(640)) if numbers.steps else "",
+        rotatable=Markup(run_page(run, photos=False, head=False, scenes=scenes).frame(640)) if numbers.steps else "",
         parts=[_part(numbers, slot) for slot in numbers.slots],
         config=flatten(numbers.description["config"]),
     )
     return write_page(run.path / "report.html" if out is None else Path(out), page)
 
 
-def _pauses(run: RunFolder, numbers: RunNumbers) -> list[dict[str, Any]]:
+def _pauses(run: RunFolder, numbers: RunNumbers, scenes: Sequence[ShownPause]) -> list[dict[str, Any]]:
     """The answer, the image and the hypotheses of each pause, for the template."""
-    scenes = scenes_of_run(run) if numbers.steps else []
     found = answers_of_run(run)
     volumes = [view.hypothesis for scene in scenes for view in scene.views]
     view = viewpoint(volumes, run.camera(0)) if scenes else None
@@ -91,16 +89,8 @@ def _answer(answer: Answer, mesh: bool) -> dict[str, Any]:
         "outlines": [(one, hexadecimal(colour(one.number - 1))) for one in answer.outlines],
         "borders": [(one, hexadecimal(border_colour(one.one_object))) for one in answer.borders],
         "rows": table_cells(answer.table),
-        "mesh": _mesh(answer.table) if mesh else "",
+        "mesh": mesh_link(answer.table) if mesh else "",
     }
-
-
-def _mesh(table: ObjectTable) -> str:
-    """The smooth objects of a table as a data URI of a .glb file; empty if there are none."""
-    if not len(table):
-        return ""
-    data = mesh_bytes(table, "glb", {one.number: colour(one.number - 1) for one in table})
-    return f"data:model/gltf-binary;base64,{b64encode(data).decode()}"
 
 
 def scene_content(scene: ShownPause, volumes: Sequence[Hypothesis], view: Camera) -> dict[str, Any]:

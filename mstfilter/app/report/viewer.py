@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from mstfilter.app.report.answer import TABLE_COLUMNS, Answer, answers_of_run, mesh_link, table_cells
 from mstfilter.app.report.pictures import data_uri, hexadecimal, jpeg_bytes
 from mstfilter.app.report.scenes import ShownHypothesis, ShownPause, scenes_of_recording, scenes_of_run
 from mstfilter.base.files import check_output, write_text
@@ -60,15 +61,25 @@ def show_hypothesis(hypothesis: Hypothesis, title: str = "") -> ScenePage:
     )
 
 
-def run_page(run: RunFolder | str | Path, *, photos: bool = True, head: bool = True) -> ScenePage:
-    """All pauses of a run as a page. `photos` adds the images to the voxels, and `head` adds the title.
+def run_page(
+    run: RunFolder | str | Path,
+    *,
+    photos: bool = True,
+    head: bool = True,
+    scenes: Sequence[ShownPause] | None = None,
+) -> ScenePage:
+    """All pauses of a run as a page.
 
-    Raises InputError if the folder is damaged or no pause is complete.
+    `photos` adds the images to the voxels. `head` adds the title, what is known in words, the table of objects, and a
+    mesh of them. `scenes` are those of `scenes_of_run`, if they were made before. Raises InputError if the folder is
+    damaged or no pause is complete.
     """
     run = (run if isinstance(run, RunFolder) else RunFolder.open(run)).check_begun()
     description = run.description
     title = str(description["recording"]["name"])
-    return _page(scenes_of_run(run), title, str(description["description"]), photos=photos, head=head)
+    answers = answers_of_run(run) if head else []
+    shown = scenes_of_run(run) if scenes is None else scenes
+    return _page(shown, title, str(description["description"]), answers, photos=photos, head=head)
 
 
 def recording_page(recording: Recording) -> ScenePage:
@@ -79,7 +90,13 @@ def recording_page(recording: Recording) -> ScenePage:
 
 
 def _page(
-    scenes: Sequence[ShownPause], title: str, note: str = "", *, photos: bool = True, head: bool = True
+    scenes: Sequence[ShownPause],
+    title: str,
+    note: str = "",
+    answers: Sequence[tuple[Answer, list[str]]] = (),
+    *,
+    photos: bool = True,
+    head: bool = True,
 ) -> ScenePage:
     boxes = [box for scene in scenes for v in scene.views if (box := occupied_box(v.hypothesis.labels > 0))]
     grid = scenes[0].views[0].hypothesis.grid
@@ -96,6 +113,8 @@ def _page(
         "camera": None if camera is None else ((camera.position - grid.origin) / grid.voxel_size).round(1).tolist(),
         "head": head,
         "pauses": [_scene_data(scene, photos) for scene in scenes],
+        "columns": list(TABLE_COLUMNS.values()),
+        "said": [_said(answer, happened, title) for answer, happened in answers],
     }
     template = (files("mstfilter.app.report") / "templates" / "viewer.html").read_text(encoding="utf-8")
     text = json.dumps(data).replace("<", "\\u003c")
@@ -139,6 +158,17 @@ def _scene_data(scene: ShownPause, photos: bool) -> dict[str, Any]:
     photo = data_uri(jpeg_bytes(scene.image), "jpeg") if photos and scene.image is not None else None
     name = f"{scene.name}, {scene.time:.1f} s" if scene.name else ""
     return {"name": name, "photo": photo, "views": views, "links": scene.links}
+
+
+def _said(answer: Answer, happened: Sequence[str], title: str) -> dict[str, Any]:
+    """What is known at a pause, in words, and the rows of the table of objects, for the script of the page."""
+    rows = table_cells(answer.table)
+    return {
+        "text": " ".join([*happened, *answer.sentences]),
+        "rows": [[row["colour"], *(row[name] for name in TABLE_COLUMNS)] for row in rows],
+        "mesh": mesh_link(answer.table),
+        "file": f"{title}.glb",
+    }
 
 
 def encode_runs(labels: np.ndarray) -> np.ndarray:

@@ -65,7 +65,7 @@ def draw_objects(
     if family.furniture and rng.uniform() < family.furniture:
         kind = int(rng.integers(3))
         if kind == 0:
-            wall = _draw_wall(rng)
+            wall = draw_wall(rng)
         else:
             base = True
             shapes.append(board(rng) if kind == 1 else tray(rng))
@@ -102,7 +102,7 @@ def draw_objects(
     return SceneObjects(tuple(shapes), tuple(skins), tuple(twin_of), tuple(groups), family.n_dropped, base, wall)
 
 
-def _draw_wall(rng: np.random.Generator) -> Wall:
+def draw_wall(rng: np.random.Generator) -> Wall:
     """A wall behind the objects, or to their left or right."""
     height = float(rng.uniform(0.15, 0.35))
     if rng.uniform() < 0.6:

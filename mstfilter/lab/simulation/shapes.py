@@ -40,7 +40,7 @@ True
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -223,11 +223,14 @@ class Part:
         return self.position - reach, self.position + reach
 
 
-def label_voxels(shapes: Sequence[Shape], poses: np.ndarray, grid: VoxelGrid) -> np.ndarray:
+def label_voxels(
+    shapes: Sequence[Shape], poses: np.ndarray, grid: VoxelGrid, thin: Collection[int] = ()
+) -> np.ndarray:
     """Labels (X, Y, Z) uint16: k + 1 for the voxels of shape k (see the definition above), and 0 for other voxels.
 
     `poses` (n, 4, 4) are T_world_object. Objects at rest overlap by less than a millimetre. A voxel of two objects
-    gets the label of the object that has its centre, and otherwise of the first object.
+    gets the label of the object that has its centre, and otherwise of the first object. The rule of thin
+    walls is for meshes, and for the shapes with the indices `thin`.
     """
     labels = np.zeros(grid.shape, np.uint16)
     thin: list[tuple[tuple[slice, ...], np.ndarray, int]] = []
@@ -242,7 +245,7 @@ def label_voxels(shapes: Sequence[Shape], poses: np.ndarray, grid: VoxelGrid) ->
                 continue
             block = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
             labels[block][(labels[block] == 0) & _centres_inside(part.shape, turn, at, grid, low, high)] = k + 1
-            if part.shape.surface is not None:
+            if k in thin or part.shape.surface is not None:
                 thin.append((block, _thin_walls(part.shape, turn, at, grid, low, high), k))
     for block, walls, k in thin:
         labels[block][(labels[block] == 0) & walls] = k + 1

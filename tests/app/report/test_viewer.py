@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from mstfilter.app.report import recording_page, run_page, viewer, write_report
+from mstfilter.app.report.answer import TABLE_COLUMNS, answers_of_run, table_cells
 from mstfilter.base.errors import InputError
 from mstfilter.formats import read_rgb, save_recording
 from mstfilter.scene import Hypothesis, VoxelGrid
@@ -113,6 +114,19 @@ def test_the_page_of_a_run(run):
     assert all(p["photo"] is None for p in data_of(run_page(run, photos=False))["pauses"])
 
 
+def test_the_page_has_the_words_and_the_table_of_the_report(run):
+    """Per pause, with one row an object; the frame in the report, which has its own table, leaves them out."""
+    data, answers = data_of(run_page(run)), answers_of_run(run)
+    for said, (answer, happened) in zip(data["said"], answers, strict=True):
+        assert said["text"] == " ".join([*happened, *answer.sentences])
+        for row, cells in zip(said["rows"], table_cells(answer.table), strict=True):
+            assert row == [cells["colour"], *(cells[name] for name in TABLE_COLUMNS)]
+        assert len(said["rows"][0]) == 1 + len(data["columns"])
+        mesh = base64.b64decode(said["mesh"].split(",")[1])
+        assert mesh[:4] == b"glTF" and said["file"] == "two boxes.glb"
+    assert data_of(run_page(run, head=False))["said"] == []
+
+
 def test_the_command_writes_a_file_of_the_run(run, tmp_path, capsys):
     code, out, _ = call("view", run.path, capsys=capsys)
     assert code == 0 and str(run.path / "view.html") in out
@@ -169,6 +183,8 @@ def test_a_browser_draws_a_run(run, tmp_path):
     text = browse(page, tmp_path, "--dump-dom", size="1000,800")
     last = data_of(run_page(run))["pauses"][-1]["views"]
     assert text.count("<circle") == 2 * sum(len(p["views"]) for p in data_of(run_page(run))["pauses"])
+    rows = answers_of_run(run)[-1][0].table
+    assert text.count("<tr>") == 1 + len(rows) and rows[0].number
     heaviest = volume(last[0], GRID.shape)
     assert int(re.search(r'data-faces="(\d+)"', text)[1]) == open_faces(heaviest)
     assert html.escape(last[0]["name"]) in text

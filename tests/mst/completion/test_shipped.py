@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mst_training.completion import shape_iou
+from mst_training.completion import CompletionTraining, shape_iou
 from mst_training.completion_data import CompletionSamples
-from mst_training.shapes import HELD_OUT, TRAINED
 from mstfilter.mst.completion import NetworkCompleter
 from mstfilter.mst.completion.crops import extruded
 from mstfilter.scene import Seen
@@ -19,7 +18,8 @@ SEED = 99  # of no training
 
 @pytest.fixture(scope="module")
 def samples(tmp_path_factory) -> CompletionSamples:
-    files = CompletionSamples.write(tmp_path_factory.mktemp("samples"), SEED, 4, kinds=TRAINED + HELD_OUT)
+    clutter = CompletionTraining().clutter("test")
+    files = CompletionSamples.write(tmp_path_factory.mktemp("samples"), SEED, 4, clutter=clutter)
     return CompletionSamples.read(files)
 
 
