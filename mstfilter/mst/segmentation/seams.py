@@ -6,7 +6,8 @@ that is none. `SeamTree` therefore looks again at the regions that its base tree
 It collects the ways to divide each (`mstfilter.mst.segmentation.divisions`), and a small network, the judge, gives
 the probabilities of "one object" and of each division. The most probable division becomes the first of the tree
 below this region, with the log odds of "not one" as its odds; the two sides are then examined in the same way. Where
-the base tree has a clear division, this stays, and only its odds are those of the judge.
+the base tree has a clear division, this stays, and only its odds are those of the judge. What something nearer
+divides is joined as by the base tree (`mstfilter.mst.segmentation.hidden`).
 
 >>> tree = SeamTree().build(boundary, frame)
 >>> w = MergeLogOdds().values(tree, frame)
@@ -34,9 +35,9 @@ from mstfilter.base.errors import InputError
 from mstfilter.base.fields import Bounds, PositiveFloat, Share
 from mstfilter.mst.segmentation.divisions import SeamImage, TreePart, division_overlap, divisions
 from mstfilter.mst.segmentation.learned_tree import BorderTree, tree_of_merges
-from mstfilter.mst.segmentation.regions import Regions
+from mstfilter.mst.segmentation.regions import Regions, measure_regions
 from mstfilter.mst.segmentation.seam_measures import SeamMeasures
-from mstfilter.mst.segmentation.tree import Tree, TreeBuilder
+from mstfilter.mst.segmentation.tree import Merge, Tree, TreeBuilder
 from mstfilter.scene import Frame, pixels_above_table, scaled_area
 
 if TYPE_CHECKING:
@@ -94,7 +95,10 @@ class SeamTree(TreeBuilder):
         seen = self.base.look(frame)
         regions = self.base.regions(boundary, frame, pixels, seen)
         image, merges = SeamImage.of(frame, boundary, seen), self.base.merges(regions)
-        return _Examination(self, self._judge(), image, regions, merges).tree()
+        leaves, merges = _Examination(self, self._judge(), image, regions, merges).tree()
+        divided = measure_regions(leaves, frame, boundary, seen)
+        merges = self.base.joined(by_odds(merges, len(divided.sums)), divided, frame)
+        return tree_of_merges(leaves, len(divided.sums), merges)
 
     def _judge(self) -> SeamNetwork:
         from mstfilter.mst.segmentation.seam_network import load_seam_network
@@ -138,6 +142,17 @@ def least_examined(size: int) -> float:
 def within(parts: Sequence[TreePart], side: np.ndarray) -> list[TreePart]:
     """The parts of one side (n,) bool of a region."""
     return [TreePart(part.side[side], part.odds) for part in parts]
+
+
+def by_odds(merges: Sequence[Merge], n: int) -> list[Merge]:
+    """The merges of a tree with `n` leaves in ascending order of the largest log odds in a node."""
+    largest = np.full(n + len(merges), -np.inf)
+    for k, (a, b, odds) in enumerate(merges):
+        largest[n + k] = max(odds, largest[a], largest[b])
+    order = np.argsort(largest[n:], kind="stable")
+    number = np.arange(n + len(merges))
+    number[n + order] = n + np.arange(len(merges))
+    return [(int(number[a]), int(number[b]), odds) for a, b, odds in (merges[k] for k in order)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,14 +255,14 @@ class _Examination:
         self.n_leaves = 1
         self.joins: list[tuple[tuple[str, int], tuple[str, int], float]] = []
 
-    def tree(self) -> Tree:
-        """The tree."""
+    def tree(self) -> tuple[np.ndarray, list[Merge]]:
+        """The leaf (H, W) of every pixel, and the merges."""
         for node in self.base.top():
             self._upper(node)
         n = self.n_leaves
         number = {"leaf": 0, "join": n}
         merges = [(number[a[0]] + a[1], number[b[0]] + b[1], odds) for a, b, odds in self.joins]
-        return tree_of_merges(self.leaves.reshape(self.base.image.shape), n, merges)
+        return self.leaves.reshape(self.base.image.shape), merges
 
     def _join(self, a: tuple[str, int], b: tuple[str, int], odds: float) -> tuple[str, int]:
         self.joins.append((a, b, odds))

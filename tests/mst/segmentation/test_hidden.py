@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from mstfilter.mst.segmentation import BorderTree, ColourDepthBoundary, hidden
+from mstfilter.mst.segmentation import BorderTree, ColourDepthBoundary, SeamTree, hidden
 from mstfilter.mst.segmentation.hidden import DISAGREEMENT, _inserted, hidden_pairs, likely_segments, with_joins
 from mstfilter.mst.segmentation.regions import REGION, Regions, measure_regions
+from mstfilter.mst.segmentation.seams import by_odds
 from mstfilter.scene import render
 from tests.mst.segmentation.scenes import GRID, boxes, camera, frame_of
 
@@ -78,11 +79,12 @@ def test_a_join_is_a_node_of_the_tree(monkeypatch, even, joined):
         assert found == merges
 
 
-def test_the_border_tree_has_the_join():
+@pytest.mark.parametrize("kind", [BorderTree, lambda joins: SeamTree(base=BorderTree(joins=joins))])
+def test_the_trees_have_the_join(kind):
     frame, truth, _ = seen(BOX, POLE)
     boundary = ColourDepthBoundary().boundary(frame)
     for joins in (True, False):
-        tree = BorderTree(joins=joins).build(boundary, frame)
+        tree = kind(joins=joins).build(boundary, frame)
         masks = [tree.mask(node) for node in range(tree.n_nodes - 1)]
         box, pole = truth == 1, truth == 2
         whole = [m for m in masks if (m & box).sum() > 0.9 * box.sum() and (m & pole).sum() < 0.1 * pole.sum()]
@@ -98,6 +100,25 @@ def random_tree(rng, n):
         merges.append((a, b, odds))
         alive = [one for one in alive if one not in (a, b)] + [n + len(merges) - 1]
     return merges
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10_000))
+def test_the_order_of_merges_by_log_odds_keeps_the_nodes(seed):
+    """From any order in which children come first, as an examination makes merges."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(2, 14))
+    merges = [(a, b, float(rng.normal(0, 4))) for a, b, _ in random_tree(rng, n)]
+    found = by_odds(merges, n)
+    nodes, most = [], []
+    for these in (merges, found):
+        below = {k: frozenset([k]) for k in range(n)}
+        largest = dict.fromkeys(range(n), -np.inf)
+        for k, (a, b, odds) in enumerate(these):
+            below[n + k], largest[n + k] = below[a] | below[b], max(odds, largest[a], largest[b])
+        nodes.append({(below[n + k], odds) for k, (_, _, odds) in enumerate(these)})
+        most.append([largest[n + k] for k in range(len(these))])
+    assert nodes[0] == nodes[1] and most[1] == sorted(most[0])
 
 
 @settings(max_examples=60, deadline=None)
