@@ -23,7 +23,7 @@ import numpy as np
 from mst_training.scenes import HEIGHT, WIDTH, Samples, View, displaced, draw_camera, on_table
 from mstfilter.base.errors import InputError
 from mstfilter.lab.simulation.sensor import DepthSensor, colour_reading
-from mstfilter.lab.simulation.world import PhysicsWorld
+from mstfilter.lab.simulation.world import OBJECT_GROUP, PIECE_GROUP, ROOM_GROUP, PhysicsWorld
 from mstfilter.mst.segmentation.border_network import CENTRE_UNIT
 from mstfilter.scene import Camera, Frame, fit_support_plane, rigid_from_matrix
 
@@ -178,7 +178,7 @@ def _colours(
     if rng.uniform() < 0.6 and direction[2] > 0.25:
         # One cast from the lamp: a point is lit if the ray to it meets nothing before.
         lamp = 3.0 * direction
-        _, reach, _ = world.cast(lamp, view.points - lamp, (0, 1))
+        _, reach, _ = world.cast(lamp, view.points - lamp, (ROOM_GROUP, OBJECT_GROUP, PIECE_GROUP))
         light = light * ((reach < 0) | (reach > 0.995))
     tint = rng.uniform(0.7, 1.0, 3)
     linear = albedo * (ambient + strength * light[:, None] * tint) * np.exp(rng.normal(0.0, 0.35))

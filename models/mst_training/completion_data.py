@@ -45,7 +45,7 @@ from mst_training.scenes import (
 from mst_training.shapes import THIN
 from mstfilter.lab.simulation.sensor import SENSORS, DepthSensor
 from mstfilter.lab.simulation.shapes import label_voxels
-from mstfilter.lab.simulation.world import PhysicsWorld
+from mstfilter.lab.simulation.world import MESH_GROUP, OBJECT_GROUP, PhysicsWorld
 from mstfilter.mst.completion import Completer, Extrude, ObservedBox, observed_box
 from mstfilter.mst.completion.crops import EDGE, LARGER, LATTICE, crop_box
 from mstfilter.mst.completion.observed import decode_signed, encode_box, observed_again
@@ -185,7 +185,7 @@ def _silhouettes(world: PhysicsWorld, camera: Camera, instance: np.ndarray) -> d
                 put_away(world, other)
         world.place(k, positions[k], rotations[k])
         world.forward()
-        geom, _, _ = cast(world, camera, (1,))
+        geom, _, _ = cast(world, camera, (OBJECT_GROUP, MESH_GROUP))
         shares[k + 1] = float(seen[k + 1] / max((geom >= 0).sum(), 1))
         world.restore(state)
     return shares

@@ -27,7 +27,7 @@ from mstfilter.lab.simulation.arrangement import SceneObjects, arrange_objects, 
 from mstfilter.lab.simulation.families import SceneFamily
 from mstfilter.lab.simulation.objects import MeshPool, open_objects
 from mstfilter.lab.simulation.shapes import Shape
-from mstfilter.lab.simulation.world import PhysicsWorld
+from mstfilter.lab.simulation.world import MESH_GROUP, OBJECT_GROUP, ROOM_GROUP, PhysicsWorld
 from mstfilter.scene import Camera, look_at, scene_cache
 
 WIDTH, HEIGHT = 320, 240  # pixels of an image
@@ -168,7 +168,7 @@ class View:
     def of(cls, world: PhysicsWorld, camera: Camera) -> Self:
         """The view of all pixels of a camera."""
         rays = world_rays(camera)
-        geom, z, normal = cast(world, camera, (0, 1))
+        geom, z, normal = cast(world, camera, (ROOM_GROUP, OBJECT_GROUP, MESH_GROUP))
         hit = geom >= 0
         instance = np.where(hit, world.geom_object[np.maximum(geom, 0)], 0).astype(np.uint8)
         points = np.array(camera.position) + rays * np.where(hit, z, 0)[:, None]

@@ -111,6 +111,11 @@ def test_meshes_are_among_the_objects(tmp_path, monkeypatch):
         assert shape.name in ("brick", "plank") and shape.half.max() <= 0.225
         factor = shape.half / np.sort({"brick": (0.05, 0.03, 0.025), "plank": (0.08, 0.025, 0.01)}[shape.name])[::-1]
         assert np.ptp(factor) < 0.02 and 0.999 <= factor[0] <= 1.501
+    world = next(w for k in range(9) if (w := clutter.draw(np.random.default_rng([2, k]))) and w.has_meshes)
+    samples = CompletionSamples.of_world(np.random.default_rng(0), world, 0)
+    assert samples is not None
+    own = samples.kind == "other"
+    assert own.any() and (samples.truth[own].sum(axis=(1, 2, 3)) > 0).all() and (samples.visible[own] > 0).all()
     training = CompletionTraining(objects="folder")
     assert [training.clutter(part).objects for part in ("train", "validation", "test")] == ["folder", "folder", ""]
     assert [training.clutter(part).pool for part in ("train", "validation")] == ["training", "tuning"]
