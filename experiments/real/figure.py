@@ -1,4 +1,4 @@
-"""The figure of the page on real images: quality of each method on each sequence, from results/sequences.csv.
+"""The figure of the page on real images: quality of each method's one answer, by sequence (results/sequences.csv).
 
     python experiments/real/figure.py [--out docs/images/real.png]
 
@@ -34,7 +34,7 @@ def main(out: Path) -> None:
     names = list(dict.fromkeys(row["sequence"] for row in rows))
     figure, axes = plt.subplots(figsize=(6.4, 0.32 * len(names) + 1.9), layout="constrained")
     for method, (label, marker, colour) in METHODS.items():
-        found = {row["sequence"]: float(row["quality"]) for row in rows if row["method"] == method}
+        found = {row["sequence"]: float(row["quality_answer"]) for row in rows if row["method"] == method}
         axes.scatter(
             [found.get(name, np.nan) for name in names], range(len(names)), s=36, c=colour, marker=marker, label=label
         )

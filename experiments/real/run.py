@@ -4,8 +4,9 @@
     python experiments/real/run.py --only mix_1,jack --methods mst,samples_only --out DIR --sheets DIR
     python experiments/real/run.py --smoke --out DIR      # one pause
 
-Needs the data in MSTFILTER_SHARED (default ../shared) under real/. Writes pauses.csv (means over the hypotheses at
-each pause), sequences.csv (means over pauses), summary.csv (`mst` minus each method, paired by sequence). With
+Needs the data in MSTFILTER_SHARED (default ../shared) under real/. Writes pauses.csv (scores of the one answer, and
+means over the hypotheses, at each pause), sequences.csv (means over pauses), summary.csv (`mst` minus each method,
+paired by sequence). With
 --sheets, the worst pauses of `mst` are drawn into a folder outside of the repository, since the images are not ours.
 """
 
@@ -48,6 +49,8 @@ METHODS: dict[str, tuple[str, ...]] = {
     "floor_components": ("floor_components",),
     "floor_one_blob": ("floor_one_blob",),
 }
+#: What is summarised: quality of the one answer, mean quality of the hypotheses, and log loss of all that is known.
+MEASURES = ("quality_answer", "quality", "log_loss")
 _WORST = 12  # pauses on a contact sheet
 
 
@@ -149,16 +152,22 @@ def sequence_means(rows: list[dict[str, str]]) -> list[dict[str, object]]:
 
 
 def summary(means: list[dict[str, object]]) -> list[dict[str, object]]:
-    """`mst` minus each method in quality, over the sequences of each source and over those with labels."""
-    table: dict[str, dict[str, dict[str, float]]] = defaultdict(lambda: defaultdict(dict))
+    """Means over the sequences of each source and over those with labels, and `mst` minus each method.
+
+    A row for each of `MEASURES`: the quality of the one answer and the log loss count.
+    """
+    table: dict[tuple[str, str], dict[str, dict[str, float]]] = defaultdict(lambda: defaultdict(dict))
     for row in means:
         for group in (row["source"], "labelled") if row["source"] in ("hots", "osd") else (row["source"],):
-            table[str(group)][str(row["method"])][str(row["sequence"])] = float(str(row["quality"]))
+            for measure in MEASURES:
+                if (value := row.get(measure)) not in (None, ""):
+                    values = table[str(group), measure][str(row["method"])]
+                    values[str(row["sequence"])] = float(str(value))
     rows = []
-    for group, methods in table.items():
+    for (group, measure), methods in table.items():
         for method, values in methods.items():
-            row: dict[str, object] = {"source": group, "method": method, "sequences": len(values)}
-            row["quality"] = round(float(np.mean(list(values.values()))), 4)
+            row = {"source": group, "measure": measure, "method": method, "sequences": len(values)}
+            row["mean"] = round(float(np.mean(list(values.values()))), 4)
             if method != "mst" and "mst" in methods and len(values) > 1:
                 d = compare(methods["mst"], values)
                 row |= {"mst_minus": round(d.mean, 4), "low": round(d.low, 4), "high": round(d.high, 4)}
