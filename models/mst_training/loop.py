@@ -51,7 +51,7 @@ class Training(ABC):
     batch: int = 16
     rate: float = 2e-3  #: largest learning rate; it falls to 0 along a cosine
     average: float = 0.999  #: decay of the moving average of the weights
-    half_precision: bool = True  #: compute in bfloat16
+    half_precision: bool = True  #: compute in bfloat16; without hardware for it, that is slower by a factor of 2.5
     start: str = ""  #: name or folder of a model of the same size whose weights are the start; none if empty
 
     #: Changes of the settings by name. "cpu" takes about four core hours, "smoke" shows that everything works.
