@@ -140,9 +140,9 @@ def _heights(bits: Tensor) -> Tensor:
 
 def _extents(bits: np.ndarray) -> np.ndarray:
     """The largest extent (n,) of the used part of crops (n, e, e, e) that are padded with zeros."""
-    used = [bits.any(axis=tuple(a for a in (1, 2, 3) if a != axis)) for axis in (1, 2, 3)]
-    edge = bits.shape[-1]
-    return np.max([edge - one[:, ::-1].argmax(axis=1) for one in used], axis=0)
+    used = [np.any(bits, axis=tuple(a for a in (1, 2, 3) if a != axis)) for axis in (1, 2, 3)]
+    last = [np.argmax(np.flip(one, axis=1), axis=1) for one in used]
+    return np.asarray(bits.shape[-1] - np.min(last, axis=0))
 
 
 def _turned(values: np.ndarray, symmetry: int) -> np.ndarray:

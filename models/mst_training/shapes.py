@@ -229,8 +229,7 @@ _KINDS: dict[str, tuple[Callable[[np.random.Generator], list[Piece]], tuple[tupl
 }
 
 HELD_OUT = ("wedge", "tee")  #: Kinds that no network is trained on; they measure how it does on new shapes
-#: Kinds with walls or parts that can be thinner than a voxel of 1 cm.
-THIN = ("bowl", "mug", "tube", "vase", "jug", "tile", "rod", "tool", "hook")
+THIN = ("bowl", "mug", "tube", "vase", "jug")  #: Kinds with walls that can be thinner than a voxel of 1 cm
 TRAINED = tuple(kind for kind in _KINDS if kind not in HELD_OUT)
 
 

@@ -233,7 +233,7 @@ def label_voxels(
     walls is for meshes, and for the shapes with the indices `thin`.
     """
     labels = np.zeros(grid.shape, np.uint16)
-    thin: list[tuple[tuple[slice, ...], np.ndarray, int]] = []
+    walled: list[tuple[tuple[slice, ...], np.ndarray, int]] = []
     for k, (whole, pose) in enumerate(zip(shapes, poses, strict=True)):
         for part in whole.surfaces:
             turn = pose[:3, :3] @ part.rotation if whole.parts else pose[:3, :3]
@@ -246,8 +246,8 @@ def label_voxels(
             block = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
             labels[block][(labels[block] == 0) & _centres_inside(part.shape, turn, at, grid, low, high)] = k + 1
             if k in thin or part.shape.surface is not None:
-                thin.append((block, _thin_walls(part.shape, turn, at, grid, low, high), k))
-    for block, walls, k in thin:
+                walled.append((block, _thin_walls(part.shape, turn, at, grid, low, high), k))
+    for block, walls, k in walled:
         labels[block][(labels[block] == 0) & walls] = k + 1
     return labels
 
