@@ -245,7 +245,7 @@ def _shift(before: BelievedObject, now: BelievedObject) -> float:
 
 
 #: The columns of the table of objects: keys of `table_cells`, and their heads.
-TABLE_COLUMNS = {
+TABLE_HEADS = {
     "number": "object",
     "exists": "exists",
     "seen": "seen",

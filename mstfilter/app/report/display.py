@@ -20,7 +20,7 @@ from typing import Any
 import matplotlib.style
 import numpy as np
 
-from mstfilter.app.report.answer import TABLE_COLUMNS, table_cells
+from mstfilter.app.report.answer import TABLE_HEADS, table_cells
 from mstfilter.app.report.charts import Drawing
 from mstfilter.app.report.identities import match_objects, weigh_distinct
 from mstfilter.app.report.page import fill_template, short_text
@@ -95,7 +95,7 @@ def to_html(value: Any) -> str:
     """HTML that shows an object of the package in a notebook: text, and pictures, a table of steps or of objects."""
     if isinstance(value, ObjectTable):
         return fill_template(
-            "objects.html", {}, head=repr(value).splitlines()[0], rows=table_cells(value), columns=TABLE_COLUMNS
+            "objects.html", {}, head=repr(value).splitlines()[0], rows=table_cells(value), columns=TABLE_HEADS
         )
     text = f'<pre style="margin:0">{html.escape(repr(value))}</pre>'
     shown = [] if isinstance(value, Infos) else pictures_of(value)

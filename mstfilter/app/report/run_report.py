@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.app.report.answer import TABLE_COLUMNS, Answer, answers_of_run, mesh_link, table_cells, widest
+from mstfilter.app.report.answer import TABLE_HEADS, Answer, answers_of_run, mesh_link, table_cells, widest
 from mstfilter.app.report.figures import quality_figure, reliability_figure
 from mstfilter.app.report.page import fill_template, flatten, note_rows, seconds_text, short_text, write_page
 from mstfilter.app.report.pictures import (
@@ -59,7 +59,7 @@ def write_report(
         filters,
         run=numbers,
         pauses=_pauses(run, numbers, scenes),
-        columns=TABLE_COLUMNS,
+        columns=TABLE_HEADS,
         figures=_figures(numbers),
         rotatable=Markup(run_page(run, photos=False, head=False, scenes=scenes).frame(640)) if numbers.steps else "",
         parts=[_part(numbers, slot) for slot in numbers.slots],

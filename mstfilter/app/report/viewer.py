@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.app.report.answer import TABLE_COLUMNS, Answer, answers_of_run, mesh_link, table_cells
+from mstfilter.app.report.answer import TABLE_HEADS, Answer, answers_of_run, mesh_link, table_cells
 from mstfilter.app.report.pictures import data_uri, hexadecimal, jpeg_bytes
 from mstfilter.app.report.scenes import ShownHypothesis, ShownPause, scenes_of_recording, scenes_of_run
 from mstfilter.base.files import check_output, write_text
@@ -113,7 +113,7 @@ def _page(
         "camera": None if camera is None else ((camera.position - grid.origin) / grid.voxel_size).round(1).tolist(),
         "head": head,
         "pauses": [_scene_data(scene, photos) for scene in scenes],
-        "columns": list(TABLE_COLUMNS.values()),
+        "columns": list(TABLE_HEADS.values()),
         "said": [_said(answer, happened, title) for answer, happened in answers],
     }
     template = (files("mstfilter.app.report") / "templates" / "viewer.html").read_text(encoding="utf-8")
@@ -165,7 +165,7 @@ def _said(answer: Answer, happened: Sequence[str], title: str) -> dict[str, Any]
     rows = table_cells(answer.table)
     return {
         "text": " ".join([*happened, *answer.sentences]),
-        "rows": [[row["colour"], *(row[name] for name in TABLE_COLUMNS)] for row in rows],
+        "rows": [[row["colour"], *(row[name] for name in TABLE_HEADS)] for row in rows],
         "mesh": mesh_link(answer.table),
         "file": f"{title}.glb",
     }

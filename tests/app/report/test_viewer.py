@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from mstfilter.app.report import recording_page, run_page, viewer, write_report
-from mstfilter.app.report.answer import TABLE_COLUMNS, answers_of_run, table_cells
+from mstfilter.app.report.answer import TABLE_HEADS, answers_of_run, table_cells
 from mstfilter.base.errors import InputError
 from mstfilter.formats import read_rgb, save_recording
 from mstfilter.scene import Hypothesis, VoxelGrid
@@ -120,7 +120,7 @@ def test_the_page_has_the_words_and_the_table_of_the_report(run):
     for said, (answer, happened) in zip(data["said"], answers, strict=True):
         assert said["text"] == " ".join([*happened, *answer.sentences])
         for row, cells in zip(said["rows"], table_cells(answer.table), strict=True):
-            assert row == [cells["colour"], *(cells[name] for name in TABLE_COLUMNS)]
+            assert row == [cells["colour"], *(cells[name] for name in TABLE_HEADS)]
         assert len(said["rows"][0]) == 1 + len(data["columns"])
         mesh = base64.b64decode(said["mesh"].split(",")[1])
         assert mesh[:4] == b"glTF" and said["file"] == "two boxes.glb"
