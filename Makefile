@@ -2,8 +2,9 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-CORE := $(VENV)/.installed
-STAMP := $(VENV)/.installed-dev
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+CORE := $(VENV)/.installed# what a user needs, and the demo
+STAMP := $(VENV)/.installed-dev# what tests and documentation need too
 
 .PHONY: demo test nightly lint docs dist clean
 
@@ -35,19 +36,19 @@ dist: $(STAMP)
 	$(BIN)/python -m build
 	$(BIN)/python -m twine check --strict dist/*
 
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
-
-# The demo needs what a user needs, and is there sooner. Modules are compiled when they are first imported.
-$(CORE): pyproject.toml constraints.txt
+# Modules are compiled when they are first imported, so the demo starts sooner.
+$(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "error: $(PYTHON) is missing or older than 3.11; hint: make PYTHON=python3.12 ..."; exit 2; }
 	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || { echo "error: $(PYTHON) has no venv module; hint: apt install python3-venv"; exit 2; }
-	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@$(PYTHON) -m venv $(VENV)
+
+$(CORE): pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) --no-compile -e .
 	@touch $@
 
-$(STAMP): $(CORE)
+$(STAMP): pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) --no-compile -e '.[dev]'
-	@touch $@
+	@touch $(CORE) $@
 
 clean:
 	rm -rf $(VENV) demo build dist docs/_build

@@ -83,15 +83,12 @@ class CompletionTraining(Training):
         sizes = _extents(larger.bits) if larger is not None else np.zeros(0, np.int64)
         for step, chosen in self.order(len(usual), first, last):
             rng = np.random.default_rng([self.seed, 2, step])
-            of: CompletionSamples = usual
-            edge = EDGE
+            of, edge = usual, EDGE
             if larger is not None and rng.uniform() < self.large:
-                edge = int(rng.choice(LARGER))
-                n = max(self.batch * EDGE**3 // edge**3, 1)
-                if (fits := np.flatnonzero(sizes <= edge)).size:
-                    of, chosen = larger, rng.choice(fits, n)
-                else:
-                    edge = EDGE
+                size = int(rng.choice(LARGER))
+                if (fits := np.flatnonzero(sizes <= size)).size:
+                    n = max(self.batch * EDGE**3 // size**3, 1)
+                    of, edge, chosen = larger, size, rng.choice(fits, n)
             cut = (slice(edge),) * 3
             turns = rng.integers(8, size=len(chosen))
             columns = (

@@ -142,7 +142,7 @@ def test_joins_keep_segments_and_every_region_has_one_way_up(seed):
     for k, (a, b, _) in enumerate(found):
         assert not below[a] & below[b]
         below[n + k] = below[a] | below[b]
-    assert len({child for a, b, _ in found for child in (a, b)}) == 2 * len(found)  # nobody has two parents
+    assert len({child for a, b, _ in found for child in (a, b)}) == 2 * len(found)  # no node has two parents
     assert max(below.values(), key=len) == frozenset(range(1, n)) if n > 2 else True
     for node in nodes[1:]:  # segments are nodes of the new tree too
         assert frozenset(np.flatnonzero(image[0] == nodes.index(node)).tolist()) in below.values()
