@@ -5,9 +5,13 @@
     python experiments/real/run.py --smoke --out DIR      # one pause
 
 Needs the data in MSTFILTER_SHARED (default ../shared) under real/. Writes pauses.csv (scores of the one answer, and
-means over the hypotheses, at each pause), sequences.csv (means over pauses), summary.csv (`mst` minus each method,
-paired by sequence). With
---sheets, the worst pauses of `mst` are drawn into a folder outside of the repository, since the images are not ours.
+means over the hypotheses, at each pause), forecasts.csv (of "do two pixels show one object?", counted by sequence),
+sequences.csv (means over pauses), and summary.csv (`mst` minus each method, paired by sequence). With --sheets, the
+worst pauses of `mst` are drawn into a folder outside of the repository, since the images are not ours.
+
+A method with one answer is always certain, which costs log loss wherever the answer is wrong. A constant doubt could
+gain as much as hypotheses. So `recalibrated_log_loss` is that of forecasts that isotonic regression corrects, fitted
+to all other sequences, of every method alike.
 """
 
 from __future__ import annotations
@@ -21,7 +25,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from folds import border_model
-from scores import identities, image_scores, kept, pixel_log_loss, witness_scores
+from scores import identities, image_scores, kept, pixel_forecasts, witness_scores
 from sequences import SHARED, Sequence, sequences
 
 from mstfilter import Belief
@@ -29,6 +33,8 @@ from mstfilter.base.files import read_csv, write_csv
 from mstfilter.mst.segmentation import BorderTree
 from mstfilter.runs.presets import preset
 from mstfilter.scene import Camera, Clip, Hypothesis, outlined, project
+from mstfilter.scoring.forecasts import SOFTENING, ForecastTable, Recalibration
+from mstfilter.scoring.log_loss import LOG_LOSS
 from mstfilter.scoring.statistics import compare
 from mstfilter.smc import Population, State
 
@@ -50,7 +56,9 @@ METHODS: dict[str, tuple[str, ...]] = {
     "floor_one_blob": ("floor_one_blob",),
 }
 #: What is summarised: quality of the one answer, mean quality of the hypotheses, and log loss of all that is known.
-MEASURES = ("quality_answer", "quality", "log_loss")
+MEASURES = ("quality_answer", "quality", "log_loss", LOG_LOSS, f"{LOG_LOSS}_kept", f"{LOG_LOSS}_answer")
+#: What forecasts are of: all that a method knows, the hypotheses that it keeps, and its one answer.
+FORECASTS = {"": "all", "_kept": "kept", "_answer": "answer"}
 _WORST = 12  # pauses on a contact sheet
 
 
@@ -77,8 +85,8 @@ def held_out(sequence: Sequence, method: str, by_sequence: bool = False) -> list
 
 def run(
     sequence: Sequence, methods: list[str], seed: int, last: int | None, by_sequence: bool = False
-) -> Iterator[dict[str, object]]:
-    """One row for each pause and method."""
+) -> Iterator[tuple[dict[str, object], dict[str, ForecastTable]]]:
+    """For each pause and method, a row of scores, and forecasts."""
     filters = {name: preset(*METHODS[name], *held_out(sequence, name, by_sequence)) for name in methods}
     states: dict[str, State] = {name: f.start(seed) for name, f in filters.items()}
     histories: dict[str, list[list[dict[str, int]]]] = defaultdict(list)  # of each hypothesis and its ancestors
@@ -113,19 +121,51 @@ def run(
                 key: round(image_scores(project(h, clip.after.camera), truth, clip.after, clip.grid)["quality"], 4)
                 for key, h in answers.items()
             }
-            losses = log_losses(belief, clip.after.camera, truth.labels)
+            forecasts = forecasts_of(belief, clip.after.camera, truth.labels)
+            losses = {
+                f"log_loss{suffix}": round(forecasts[name].log_loss(SOFTENING), 4) if forecasts[name].n else ""
+                for suffix, name in FORECASTS.items()
+            }
             followed = _kept(histories[name])
             about = {"sequence": sequence.name, "source": sequence.source, "pause": clip.index, "method": name}
-            yield about | mean | losses | least | followed | {"seconds": round(seconds, 2)}
+            yield about | mean | losses | least | followed | {"seconds": round(seconds, 2)}, forecasts
 
 
-def log_losses(belief: Belief, camera: Camera, labels: np.ndarray) -> dict[str, object]:
-    """`pixel_log_loss` of all that a method knows, of the hypotheses that it keeps, and of its one answer."""
+def forecasts_of(belief: Belief, camera: Camera, labels: np.ndarray) -> dict[str, ForecastTable]:
+    """`pixel_forecasts` of what `FORECASTS` names; empty ones where fewer than two objects are marked."""
     if len(np.unique(labels[labels > 0])) < 2:
-        return {"log_loss": "", "log_loss_kept": "", "log_loss_answer": ""}
-    answer = Belief(Population([belief.estimate()]))
-    named = {"log_loss": belief, "log_loss_kept": belief.kept, "log_loss_answer": answer}
-    return {name: round(pixel_log_loss(one, camera, labels), 4) for name, one in named.items()}
+        return dict.fromkeys(FORECASTS.values(), ForecastTable.of([], []))
+    named = {"all": belief, "kept": belief.kept, "answer": Belief(Population([belief.estimate()]))}
+    return {name: pixel_forecasts(one, camera, labels) for name, one in named.items()}
+
+
+def forecast_rows(sequence: str, method: str, tables: list[dict[str, ForecastTable]]) -> list[dict[str, object]]:
+    """The forecasts of a method in a sequence, counted over its pauses."""
+    return [
+        {"sequence": sequence, "method": method, "of": name, "p": f"{p:.2f}", "no": int(no), "yes": int(yes)}
+        for name in FORECASTS.values()
+        for table in [ForecastTable.pooled([one[name] for one in tables])]
+        for p, no, yes in zip(table.p, table.no, table.yes, strict=True)
+    ]
+
+
+def recalibrated(rows: list[dict[str, str]]) -> dict[tuple[str, str], dict[str, float]]:
+    """Recalibrated log losses of each sequence and method that has forecasts in other sequences too."""
+    groups: dict[tuple[str, str], dict[str, list[dict[str, str]]]] = defaultdict(lambda: defaultdict(list))
+    for row in rows:
+        groups[row["method"], row["of"]][row["sequence"]].append(row)
+    found: dict[tuple[str, str], dict[str, float]] = defaultdict(dict)
+    for (method, of), by_sequence in groups.items():
+        suffix = next(key for key, name in FORECASTS.items() if name == of)
+        tables = {
+            name: ForecastTable(*(np.array([float(row[key]) for row in own]) for key in ("p", "no", "yes")))
+            for name, own in by_sequence.items()
+        }
+        for name, table in tables.items():
+            if others := [one for other, one in tables.items() if other != name]:
+                loss = Recalibration.fit(ForecastTable.pooled(others)).log_loss(table)
+                found[name, method][f"{LOG_LOSS}{suffix}"] = round(loss, 4)
+    return found
 
 
 def _kept(lineages: list[list[dict[str, int]]]) -> dict[str, int]:
@@ -215,20 +255,23 @@ def main() -> None:
     if options.smoke:
         options.only, methods = "learn0-1", ["mst", "floor_image"]
     options.out.mkdir(parents=True, exist_ok=True)
-    path = options.out / "pauses.csv"
+    path, forecast_path = options.out / "pauses.csv", options.out / "forecasts.csv"
     rows: list[dict] = read_csv(path) if path.exists() else []
+    finished = {(row["sequence"], row["method"]) for row in rows}
+    forecasts: list[dict] = read_csv(forecast_path) if forecast_path.exists() else []
+    forecasts = [row for row in forecasts if (row["sequence"], row["method"]) in finished]
     wanted = options.only.split(",") if options.only else []
     for sequence in sequences(SHARED):
         if wanted and not {sequence.name, sequence.source} & set(wanted):
             continue
         done = {row["method"] for row in rows if row["sequence"] == sequence.name}
-        rows += run(
-            sequence,
-            [name for name in methods if name not in done],
-            options.seed,
-            1 if options.smoke else None,
-            options.by_sequence,
-        )
+        missing = [name for name in methods if name not in done]
+        found = list(run(sequence, missing, options.seed, 1 if options.smoke else None, options.by_sequence))
+        rows += [row for row, _ in found]
+        for name in missing:
+            tables = [of_pause for row, of_pause in found if row["method"] == name]
+            forecasts += forecast_rows(sequence.name, name, tables)
+        write_csv(forecast_path, [{key: str(value) for key, value in row.items()} for row in forecasts])
         columns = dict.fromkeys(key for row in rows for key in row)
         rows = [{key: str(row.get(key, "")) for key in columns} for row in rows]
         write_csv(path, rows)
@@ -238,11 +281,12 @@ def main() -> None:
             options.sheets.mkdir(parents=True, exist_ok=True)
             worst = sorted(own, key=lambda row: float(row["quality"]))[:_WORST]
             sheet(sequence, options.seed, [int(row["pause"]) for row in worst], options.sheets)
-    means = sequence_means(rows)
+    losses = recalibrated(forecasts)
+    means = [row | losses.get((str(row["sequence"]), str(row["method"])), {}) for row in sequence_means(rows)]
     write_csv(options.out / "sequences.csv", means, list(dict.fromkeys(key for row in means for key in row)))
-    found = summary(means)
-    write_csv(options.out / "summary.csv", found, list(dict.fromkeys(key for row in found for key in row)))
-    for row in found:
+    table = summary(means)
+    write_csv(options.out / "summary.csv", table, list(dict.fromkeys(key for row in table for key in row)))
+    for row in table:
         print("  ".join(f"{value!s:>16}" for value in row.values()))
 
 

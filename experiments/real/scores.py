@@ -2,7 +2,7 @@
 
 >>> image_scores(image, truth, frame, grid)      # quality, pieces, merged, missed, invented, found
 >>> witness_scores(hypothesis, frame, witness)   # what a second camera says
->>> pixel_log_loss(belief, camera, labels)       # of "do these two pixels show one object?"
+>>> pixel_forecasts(belief, camera, labels)      # of "do these two pixels show one object?"
 """
 
 from __future__ import annotations
@@ -110,17 +110,17 @@ def touching_pairs(labels: np.ndarray, objects: Several[int]) -> list[tuple[int,
     return [(int(a), int(b)) for (a, b), n in zip(pairs.T, counts, strict=True) if n >= 4 * _TOUCH]
 
 
-def pixel_log_loss(belief: Belief, camera: Camera, labels: np.ndarray) -> float:
-    """Mean log loss in nats of "do these two pixels show one object?", with forecasts softened to .02 and more.
+def pixel_forecasts(belief: Belief, camera: Camera, labels: np.ndarray) -> ForecastTable:
+    """Forecasts, in hundredths, of "do these two pixels show one object?"; empty without objects.
 
-    A pixel without an object shows none, so a missed object costs. NaN without objects.
+    A pixel without an object shows none, so a missed object costs.
     """
     pairs = PixelPairs.of(labels)
     if not len(pairs.a):
-        return np.nan
+        return ForecastTable.of([], [])
     rows = [np.divmod(flat, labels.shape[1]) for flat in (pairs.a, pairs.b)]
     forecast = belief.same_object_at_pixels(camera, *(np.column_stack([c, r]) for r, c in rows))
-    return ForecastTable.of(np.clip(forecast, 0, 1), pairs.same).log_loss(SOFTENING)
+    return ForecastTable.of(np.round(np.clip(forecast, 0, 1), 2), pairs.same)
 
 
 def _heights(frame: Frame, labels: np.ndarray, objects: np.ndarray) -> list[np.ndarray]:

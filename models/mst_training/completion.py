@@ -28,7 +28,7 @@ from mst_training.completion_data import MASK_KINDS, CompletionSamples, LargeSam
 from mst_training.loop import Training, fit_calibration
 from mst_training.scenes import Clutter, Samples
 from mst_training.shapes import HELD_OUT
-from mstfilter.mst.completion.crops import CHANNELS, EDGE, LARGER, LATTICE, channels, extruded
+from mstfilter.mst.completion.crops import CHANNELS, EDGE, LARGER, LATTICE, PRIOR, channels, extruded
 from mstfilter.mst.completion.unet import ARCHITECTURE, CompletionNet
 from mstfilter.scene import Seen
 from mstfilter.scoring.forecasts import ForecastTable
@@ -41,6 +41,7 @@ class CompletionTraining(Training):
     """Settings of the training of the completion network. A scene gives about 35 samples."""
 
     n_globals: int = 16  #: number of global features
+    prior: bool = True  #: the mean of `Posterior` is a channel
     objects: str = ""  #: folder of meshes; none if empty
     n_large: int = 200  #: further scenes for training, with larger objects
     large: float = 0.2  #: share of the batches with crops of larger objects; they have as many voxels as others
@@ -58,7 +59,18 @@ class CompletionTraining(Training):
     losses: ClassVar[tuple[str, ...]] = ("loss",)
 
     def networks(self) -> dict[str, nn.Module]:
-        return {"net": CompletionNet(len(CHANNELS), self.width, self.n_globals)}
+        return {"net": CompletionNet(len(self.channels), self.width, self.n_globals)}
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The channels of the input."""
+        return (*CHANNELS, PRIOR) if self.prior else CHANNELS
+
+    def first_weights(self, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The weights of the network `start`; a channel that it lacks starts with weights 0."""
+        stem, n = tensors["stem.weight"], 8 * len(self.channels)
+        more = stem.new_zeros(len(stem), max(n - stem.shape[1], 0), *stem.shape[2:])
+        return {**tensors, "stem.weight": torch.cat([stem, more], dim=1)}
 
     def clutter(self, part: str) -> Clutter:
         usual = super().clutter(part)
@@ -93,7 +105,7 @@ class CompletionTraining(Training):
             turns = rng.integers(8, size=len(chosen))
             columns = (
                 [_turned(values[i][cut], t) for i, t in zip(chosen, turns, strict=True)]
-                for values in (of.bits, of.signed, of.truth)
+                for values in (of.bits, of.signed, of.prior, of.truth)
             )
             yield tuple(torch.from_numpy(np.stack(column)) for column in columns)
 
@@ -101,8 +113,8 @@ class CompletionTraining(Training):
         self, networks: Mapping[str, Any], step: int, batch: Sequence[Tensor]
     ) -> tuple[Tensor, tuple[float, ...]]:
         """Log loss a voxel on or behind the surface."""
-        bits, signed, truth = batch
-        x = channels(bits, signed, _heights(bits)).to(bits.device)
+        bits, signed, prior, truth = batch
+        x = _input(bits, signed, prior if self.prior else None).to(bits.device)
         with torch.autocast(x.device.type, dtype=torch.bfloat16, enabled=self.half_precision):
             logits = networks["net"](x)
         unknown, own = ~Seen.FREE.among(bits), _OWN.among(bits).sum(dim=(1, 2, 3))
@@ -125,14 +137,16 @@ class CompletionTraining(Training):
         figures, rows = measure(net, calibration, test, device)
         described = {
             "lattice_m": LATTICE,
-            "network": {"channels": list(CHANNELS), "width": self.width, "n_globals": self.n_globals},
+            "network": {"channels": list(self.channels), "width": self.width, "n_globals": self.n_globals},
             "calibration": {"scale": calibration[0], "shift": calibration[1]},
         }
         return described, figures, rows
 
 
-def _heights(bits: Tensor) -> Tensor:
-    return (torch.arange(bits.shape[-1]) + 0.5) * LATTICE
+def _input(bits: Tensor, signed: Tensor, prior: Tensor | None) -> Tensor:
+    heights = (torch.arange(bits.shape[-1]) + 0.5) * LATTICE
+    x: Tensor = channels(bits, signed, heights, None if prior is None else prior.float() / 255)
+    return x
 
 
 def _extents(bits: np.ndarray) -> np.ndarray:
@@ -153,8 +167,9 @@ def _logits(net: CompletionNet, samples: CompletionSamples, device: torch.device
     with torch.inference_mode():
         for start in range(0, len(samples), 32):
             part = slice(start, min(start + 32, len(samples)))
-            bits, signed = torch.from_numpy(samples.bits[part]), torch.from_numpy(samples.signed[part])
-            yield part, net(channels(bits, signed, _heights(bits)).to(device)).cpu()
+            columns = (torch.from_numpy(v[part]) for v in (samples.bits, samples.signed, samples.prior))
+            bits, signed, prior = columns
+            yield part, net(_input(bits, signed, prior if net.has_prior else None).to(device)).cpu()
 
 
 def evaluate(net: CompletionNet, samples: CompletionSamples, device: torch.device) -> dict[str, float]:

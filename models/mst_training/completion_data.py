@@ -46,7 +46,7 @@ from mst_training.shapes import THIN
 from mstfilter.lab.simulation.sensor import SENSORS, DepthSensor
 from mstfilter.lab.simulation.shapes import label_voxels
 from mstfilter.lab.simulation.world import MESH_GROUP, OBJECT_GROUP, PhysicsWorld
-from mstfilter.mst.completion import Completer, Extrude, ObservedBox, observed_box
+from mstfilter.mst.completion import Completer, Extrude, ObservedBox, Posterior, observed_box
 from mstfilter.mst.completion.crops import EDGE, LARGER, LATTICE, crop_box
 from mstfilter.mst.completion.observed import decode_signed, encode_box, observed_again
 from mstfilter.mst.segmentation import MetropolisHastingsCuts, TreeCutProposal
@@ -71,6 +71,7 @@ class CompletionSamples(Samples):
 
     bits: np.ndarray  #: (n, e, e, e) uint8, flags of `Seen`; e is `edge`
     signed: np.ndarray  #: (n, e, e, e) int8
+    prior: np.ndarray  #: (n, e, e, e) uint8, 255 times the mean occupancy of `Posterior`
     truth: np.ndarray  #: (n, e, e, e) bool
     kind: np.ndarray  #: (n,) str, kind of the shape with most pixels in the mask
     mask: np.ndarray  #: (n,) uint8, index in `MASK_KINDS`
@@ -104,14 +105,14 @@ class CompletionSamples(Samples):
         for mask in draw_masks(rng, frame, instance, _GRID, _N_MASKS):
             found = _sample(rng, frame, instance, mask, truth, earlier, (cls.smallest, cls.edge))
             if found is not None:
-                which, bits, signed, shape, k = found
-                rows.append((bits, signed, shape, world.shapes[k - 1].family, which, alone[k]))
+                which, (bits, signed, prior, shape), k = found
+                rows.append((bits, signed, prior, shape, world.shapes[k - 1].family, which, alone[k]))
         if not rows:
             return None
         columns = [np.array(column) for column in zip(*rows, strict=True)]
-        bits, signed, shapes, kinds, masks, visible = columns
+        bits, signed, priors, shapes, kinds, masks, visible = columns
         scene = np.full(len(bits), index, np.int32)
-        return cls(bits, signed, shapes, kinds, masks.astype(np.uint8), scene, visible.astype(np.float32))
+        return cls(bits, signed, priors, shapes, kinds, masks.astype(np.uint8), scene, visible.astype(np.float32))
 
     def box(self, k: int) -> ObservedBox:
         """What sample k shows, as a completer sees it."""
@@ -229,8 +230,8 @@ def _sample(
     truth: np.ndarray,
     earlier: Sequence[_Earlier],
     edges: tuple[int, int] = (0, EDGE),
-) -> tuple[int, np.ndarray, np.ndarray, np.ndarray, int] | None:
-    """Kind of mask, bits, distances, true shape and main object of one mask.
+) -> tuple[int, tuple[np.ndarray, ...], int] | None:
+    """Kind of mask; bits, distances, prior and true shape; and main object of one mask.
 
     None if it shows no object, or none that is larger than the first of `edges`; the second is that of the crop.
     """
@@ -254,8 +255,8 @@ def _sample(
     for k in found:
         shape |= claimed_voxels(frame, instance == k, near, truth[box] == k, _GRID, offset)
     index = 2 if len(found) > 1 else int(counts[main] < _WHOLE * whole[main])
-    bits, signed = (_padded(one, edge) for one in encode_box(seen))
-    return index, bits, signed, _padded(shape, edge), main
+    prior = np.rint(255 * Posterior().fill(rng, seen)).astype(np.uint8)
+    return index, tuple(_padded(one, edge) for one in (*encode_box(seen), prior, shape)), main
 
 
 @dataclass(frozen=True)

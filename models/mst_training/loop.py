@@ -100,6 +100,10 @@ class Training(ABC):
     def networks(self) -> dict[str, nn.Module]:
         """New networks by name: ``net``, and those that only the training uses."""
 
+    def first_weights(self, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The weights of ``net`` at the start, from those of the model `start`."""
+        return dict(tensors)
+
     @abstractmethod
     def batches(self, samples: Any, first: int, last: int) -> Iterator[tuple[Tensor, ...]]:
         """Batches of the steps first .. last - 1."""
@@ -202,7 +206,9 @@ class _Run:
         self.networks = {name: network.to(device) for name, network in settings.networks().items()}
         if settings.start:
             tensors = open_model(settings.start, settings.architecture).tensors
-            self.networks["net"].load_state_dict({name: torch.from_numpy(value) for name, value in tensors.items()})
+            self.networks["net"].load_state_dict(
+                settings.first_weights({name: torch.from_numpy(value) for name, value in tensors.items()})
+            )
         self.averaged = copy.deepcopy(self.networks["net"])
         self.parameters = [p for network in self.networks.values() for p in network.parameters() if p.requires_grad]
         self.optimiser = torch.optim.AdamW(self.parameters, lr=settings.rate, weight_decay=0.01)

@@ -107,6 +107,30 @@ def test_the_wall_is_no_object(scores, monkeypatch):
     assert found["covered_objects"] > 0.9
 
 
+def test_certainty_pays_only_if_it_is_deserved():
+    """Recalibrated by the other sequences, a method with one answer has the loss of its frequency of errors."""
+    with own_modules(EXPERIMENTS / "real"):
+        run = importlib.import_module("run")
+    certain = [("0.00", 70, 30), ("1.00", 20, 80)]
+    graded = [("0.00", 60, 0), ("0.40", 20, 20), ("1.00", 10, 90)]
+    rows = [
+        {"sequence": name, "method": method, "of": "all", "p": p, "no": f"{times * no}", "yes": f"{times * yes}"}
+        for name, times in (("a", 1), ("b", 3))
+        for method, table in (("certain", certain), ("graded", graded))
+        for p, no, yes in table
+    ]
+    found = run.recalibrated(rows)
+
+    def entropy(p):
+        return -p * np.log(p) - (1 - p) * np.log(1 - p)
+
+    for name in "ab":
+        assert found[name, "certain"][run.LOG_LOSS] == pytest.approx((entropy(0.3) + entropy(0.2)) / 2, abs=1e-3)
+        expected = (40 * entropy(0.5) + 100 * entropy(0.1)) / 200
+        assert found[name, "graded"][run.LOG_LOSS] == pytest.approx(expected, abs=2e-3)
+    assert not run.recalibrated([row for row in rows if row["sequence"] == "a"])  # nothing to fit it to
+
+
 @pytest.mark.nightly
 def test_small_form(tmp_path, shared_data):
     shared_data("real/osd_learn")

@@ -65,6 +65,13 @@ def test_what_samples_show(samples):
     assert ((samples.visible > 0) & (samples.visible <= 1.05)).all()
 
 
+def test_the_prior_is_that_of_the_completer(samples):
+    """It says little of free space, and more of what is inside of the object than of the rest."""
+    free, p = Seen.FREE.among(samples.bits), samples.prior / 255
+    assert p[free].mean() < 0.01
+    assert p[samples.truth].mean() > 0.4 > 4 * p[~samples.truth & ~free].mean()
+
+
 def test_parts_of_an_object_share_its_voxels(samples):
     """Parts get less than whole objects in proportion to what is visible of them."""
     volume, surface = samples.truth.sum(axis=(1, 2, 3)), (samples.bits & 1).sum(axis=(1, 2, 3))
@@ -82,9 +89,9 @@ def test_larger_objects_are_whole_and_in_batches_of_their_own(samples):
     steps = 40
     settings = replace(SMALL, large=0.5, batch=16, steps=steps)
     counts: dict[int, int] = {}
-    for bits, signed, truth in settings.batches((samples, large), 0, steps):
+    for bits, signed, prior, truth in settings.batches((samples, large), 0, steps):
         n, edge = bits.shape[:2]
-        assert bits.shape == signed.shape == truth.shape == (n, *(edge,) * 3)
+        assert bits.shape == signed.shape == prior.shape == truth.shape == (n, *(edge,) * 3)
         assert n == {32: 16, 48: 4, 64: 2}[edge]
         counts[edge] = counts.get(edge, 0) + 1
         if edge == 64:  # whole crops, turned about the vertical
@@ -173,13 +180,15 @@ def test_earlier_views_are_evidence_about_the_object():
             completion_data._sample(np.random.default_rng(0), frame, instance, instance == k, truth, views)
             for views in ((), frames)
         ]
-        if None in samples or samples[1][3].shape != (32, 32, 32) or not np.array_equal(samples[0][3], samples[1][3]):
+        if None in samples:
+            continue
+        (alone, *_, shape), (more, *_, again) = (found for _, found, _ in samples)
+        if not np.array_equal(shape, again):
             continue  # the crop has another place
-        (_, alone, *_), (_, more, *_) = samples
         compared += 1
         assert sum(f.among(more).sum() - f.among(alone).sum() for f in (Seen.SURFACE, Seen.FREE)) >= 0
         assert not (Seen.FREE.among(more) & Seen.SURFACE.among(more)).any()
-        assert (samples[1][3] & Seen.FREE.among(more)).sum() <= 0.1 * samples[1][3].sum()  # errors of the motion
+        assert (shape & Seen.FREE.among(more)).sum() <= 0.1 * shape.sum()  # errors of the motion
     assert compared >= 1
 
 
@@ -264,6 +273,15 @@ def test_training_starts_from_a_model(files, tmp_path):
     run_training(replace(SMALL, start=str(tmp_path / "start"), rate=0.0, steps=1), tmp_path / "a")
     for name, tensor in open_model(str(tmp_path / "a"), SMALL.architecture).tensors.items():
         np.testing.assert_allclose(tensor, tensors[name], atol=1e-6)
+
+
+def test_a_channel_that_the_first_model_lacks_has_weights_0():
+    torch.manual_seed(0)
+    plain = replace(SMALL, prior=False).networks()["net"]
+    more = SMALL.networks()["net"]
+    more.load_state_dict(SMALL.first_weights(plain.state_dict()))
+    x = torch.rand(1, 9, 32, 32, 32)
+    assert torch.allclose(plain(x[:, :8]), more(x), atol=1e-5) and more.has_prior and not plain.has_prior
 
 
 def test_sizes_of_training_shapes():

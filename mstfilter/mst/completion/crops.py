@@ -37,6 +37,8 @@ CHANNELS = (
     "height",
     "extruded",
 )
+#: A further channel that a network of the package may have: the mean of `Posterior`.
+PRIOR = "posterior"
 
 
 @dataclass(frozen=True)
@@ -72,8 +74,8 @@ def crop_box(voxels: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarra
     return np.maximum(start, 0), np.minimum(start + edge, grid.shape)
 
 
-def channels(bits: Any, signed: Any, height: Any) -> Any:
-    """Input (b, 8, X, Y, Z) float32 of the network, as a torch tensor.
+def channels(bits: Any, signed: Any, height: Any, prior: Any = None) -> Any:
+    """Input (b, 8, X, Y, Z) float32 of the network, as a torch tensor; with a prior, there are nine channels.
 
     Parameters
     ----------
@@ -81,15 +83,20 @@ def channels(bits: Any, signed: Any, height: Any) -> Any:
         Flags and distances of `encode_box`, padded with zeros.
     height : (Z,) float tensor
         Heights of the layers above the table in metres.
+    prior : (b, X, Y, Z) float tensor, optional
+        Probabilities for the channel `PRIOR`.
     """
     import torch
 
-    x = torch.empty((len(bits), len(CHANNELS), *bits.shape[1:]), dtype=torch.float32)
+    n = len(CHANNELS) + (prior is not None)
+    x = torch.empty((len(bits), n, *bits.shape[1:]), dtype=torch.float32)
     for k, flag in enumerate(Seen):
         x[:, k] = flag.among(bits)
     x[:, 5] = signed.float() / 127
     x[:, 6] = height / 0.25
     x[:, 7] = extruded(bits)
+    if prior is not None:
+        x[:, 8] = prior
     return x
 
 

@@ -134,7 +134,8 @@ class EllipsoidKind(ShapeKind):
 class SuperquadricKind(ShapeKind):
     """Superquadrics with exponents of 2 to 8: from ellipsoids over cushions and discs to nearly boxes.
 
-    The distance is that of first order, (F - 1) / |grad F| of a function F of degree 1 that is 1 on the surface.
+    The distance is that of first order, (F - 1) / |grad F| of a function F of degree 1 that is 1 on the surface. So
+    points are scaled to a largest coordinate of 1, for which no power overflows, and F is scaled back.
     """
 
     n_shape: ClassVar[int] = 2
@@ -142,7 +143,9 @@ class SuperquadricKind(ShapeKind):
     def distance(self, half: np.ndarray, shape: np.ndarray, x: np.ndarray) -> np.ndarray:
         p, q = (2 * 4 ** shape[k] for k in range(2))
         q = np.where(x[2] < 0, 8.0, q)  # what stands has a flat bottom
-        scaled = [np.maximum(np.abs(x[k]) / half[k], 1e-3) for k in range(3)]
+        scaled = [np.abs(x[k]) / half[k] for k in range(3)]
+        largest = np.maximum(np.maximum.reduce(scaled), 1e-3)
+        scaled = [np.maximum(one / largest, 1e-3) for one in scaled]
         a, b = _power(scaled[0], p), _power(scaled[1], p)
         across = a + b
         flat, tall = _power(across, q / p), _power(scaled[2], q)
@@ -151,7 +154,7 @@ class SuperquadricKind(ShapeKind):
         flat /= across
         slopes = (flat * a / (scaled[0] * half[0]), flat * b / (scaled[1] * half[1]), tall / (scaled[2] * half[2]))
         steep = np.sqrt(sum(one * one for one in slopes)) * f / total
-        return np.asarray((f - 1) / steep)
+        return np.asarray((largest * f - 1) / steep)
 
 
 @dataclass(frozen=True)

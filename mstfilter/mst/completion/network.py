@@ -22,6 +22,7 @@ from mstfilter.mst.completion.crops import BATCH, EDGE, LARGER, Architecture
 from mstfilter.mst.completion.extrude import Extrude
 from mstfilter.mst.completion.lattice import OnLattice
 from mstfilter.mst.completion.observed import ObservedBox
+from mstfilter.mst.completion.posterior import Posterior
 from mstfilter.scene import Recording, UsesFiles
 
 if TYPE_CHECKING:
@@ -48,6 +49,9 @@ class NetworkCompleter(OnLattice, UsesFiles):
         Added to the log odds of every voxel with a probability between 0 and 1, because the network is calibrated for
         the masks of its training scenes and not for those of a filter. The default was fitted to runs of `mst`
         (`experiments/partition_fit`).
+    prior : Posterior
+        The prior over whole shapes, whose mean is a channel of the package's network. A network without this channel
+        does not use it.
     architecture : Architecture, optional
         That of the model in the folder. The default is that of the package's network.
     """
@@ -55,6 +59,7 @@ class NetworkCompleter(OnLattice, UsesFiles):
     weights: str = "completion"
     least_surface: Share = 2 / 3
     log_odds: Annotated[float, Bounds()] = 0.2
+    prior: Posterior = Posterior()  # noqa: RUF009 (frozen)
     architecture: Architecture | None = None
 
     @property
@@ -90,7 +95,9 @@ class NetworkCompleter(OnLattice, UsesFiles):
         for edge, members in by_edge.items():
             for start in range(0, len(members), BATCH):
                 chosen = members[start : start + BATCH]
-                p = self.network.probabilities([seen[k] for k in chosen], edge)
+                boxes = [seen[k] for k in chosen]
+                priors = [self.prior.fill(rngs[k], seen[k]) for k in chosen] if self.network.has_prior else None
+                p = self.network.probabilities(boxes, edge, priors)
                 for k, one in zip(chosen, p, strict=True):
                     a, b, c = seen[k].surface.shape
                     results[k] = self._with_surface(one[:a, :b, :c], seen[k])

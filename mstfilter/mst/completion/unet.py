@@ -28,10 +28,11 @@ from torch.nn import functional
 from mstfilter.base.errors import InputError, describe_error, missing_library
 from mstfilter.base.reading import MAX_WEIGHTS, read_bytes
 from mstfilter.base.trained import calibrated_network, layer_size, load_once, one_thread, open_model
-from mstfilter.mst.completion.crops import BATCH, CHANNELS, EDGE, LARGER, Architecture, channels
+from mstfilter.mst.completion.crops import BATCH, CHANNELS, EDGE, LARGER, PRIOR, Architecture, channels
 from mstfilter.mst.completion.observed import ObservedBox, encode_box
 
 ARCHITECTURE = "completion-unet"
+_EXTRUDED = CHANNELS.index("extruded")
 _LONGEST_S = 600.0  # of a call of a network in ONNX
 
 
@@ -80,6 +81,7 @@ class CompletionNet(nn.Module):
 
     def __init__(self, channels: int, width: int, n_globals: int) -> None:
         super().__init__()
+        self.has_prior = channels > len(CHANNELS)
         self.stem = nn.Conv3d(8 * channels, width, 3, padding=1)
         self.fine = _Block(width)
         self.down1 = nn.Conv3d(width, 2 * width, 2, stride=2)
@@ -114,7 +116,7 @@ class CompletionNet(nn.Module):
         y = functional.interpolate(self.up2(y), scale_factor=2)
         y = self.end(self.join2(torch.cat([y, fine], dim=1)))
         logits = _to_voxels(self.head(functional.silu(y)).float())
-        return logits + self.rule[0] + self.rule[1] * x[:, -1].float()
+        return logits + self.rule[0] + self.rule[1] * x[:, _EXTRUDED].float()
 
 
 class TrainedNetwork:
@@ -128,22 +130,45 @@ class TrainedNetwork:
         Key of the contents of the weights.
     scale, shift : float
         Calibration of the logits.
+    has_prior : bool
+        Whether the input has the channel `PRIOR`.
     """
 
-    def __init__(self, forward: Callable[[Tensor], Tensor], key: str, scale: float = 1, shift: float = 0) -> None:
+    def __init__(
+        self,
+        forward: Callable[[Tensor], Tensor],
+        key: str,
+        scale: float = 1,
+        shift: float = 0,
+        has_prior: bool = False,
+    ) -> None:
         self.forward, self.key, self.scale, self.shift = forward, key, scale, shift
+        self.has_prior = has_prior
 
-    def probabilities(self, seen: Sequence[ObservedBox], edge: int) -> np.ndarray:
-        """Calibrated probabilities (n, edge, edge, edge) float32 of at most `BATCH` boxes."""
+    def probabilities(
+        self, seen: Sequence[ObservedBox], edge: int, priors: Sequence[np.ndarray] | None = None
+    ) -> np.ndarray:
+        """Calibrated probabilities (n, edge, edge, edge) float32 of at most `BATCH` boxes.
+
+        A network with the channel `PRIOR` needs its values for each box, an array of the shape of the box.
+        """
         bits = np.zeros((BATCH, edge, edge, edge), np.uint8)
         signed = np.zeros(bits.shape, np.int8)
+        prior = np.zeros(bits.shape, np.float32)
         height = np.zeros(edge)
         for k, one in enumerate(seen):
             a, b, c = one.surface.shape
             bits[k, :a, :b, :c], signed[k, :a, :b, :c] = encode_box(one)
             height = one.height[0] + one.voxel_size * np.arange(edge)
+            if priors is not None:
+                prior[k, :a, :b, :c] = priors[k]
         with torch.inference_mode(), one_thread():
-            x = channels(torch.from_numpy(bits), torch.from_numpy(signed), torch.from_numpy(height).float())
+            x = channels(
+                torch.from_numpy(bits),
+                torch.from_numpy(signed),
+                torch.from_numpy(height).float(),
+                torch.from_numpy(prior) if self.has_prior else None,
+            )
             p = torch.sigmoid(self.scale * self.forward(x) + self.shift)
         return np.asarray(p.numpy()[: len(seen)])
 
@@ -156,14 +181,14 @@ def load_network(name: str, architecture: Architecture | None = None) -> Trained
     """
     if architecture is None and not name.endswith(".onnx"):
         model = open_model(name, ARCHITECTURE)
+        has_prior = PRIOR in model.description.get("network", {}).get("channels", ())
+        names = (*CHANNELS, PRIOR) if has_prior else CHANNELS
         net, scale, shift = calibrated_network(
             model,
-            CHANNELS,
-            lambda values: CompletionNet(
-                len(CHANNELS), layer_size(values, "width"), layer_size(values, "n_globals", 0)
-            ),
+            names,
+            lambda values: CompletionNet(len(names), layer_size(values, "width"), layer_size(values, "n_globals", 0)),
         )
-        return TrainedNetwork(net, model.key, scale, shift)
+        return TrainedNetwork(net, model.key, scale, shift, has_prior)
     if name.endswith(".onnx"):
         if architecture is not None:
             raise InputError(f"{name} contains its architecture", "leave the field architecture out")

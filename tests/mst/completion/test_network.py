@@ -10,9 +10,17 @@ import torch
 from scipy.special import expit, logit
 
 from mstfilter.base.errors import InputError
-from mstfilter.base.trained import write_model
-from mstfilter.mst.completion import Completion, Extrude, NetworkCompleter, arbitrate, observed_box
-from mstfilter.mst.completion.crops import CHANNELS, channels, crop_box, extruded
+from mstfilter.base.trained import open_model, write_model
+from mstfilter.mst.completion import (
+    Completion,
+    Extrude,
+    NetworkCompleter,
+    Posterior,
+    arbitrate,
+    observed_box,
+)
+from mstfilter.mst.completion.crops import CHANNELS, PRIOR, channels, crop_box, extruded
+from mstfilter.mst.completion.kinds import BoxKind, EllipsoidKind, ShapeKind
 from mstfilter.mst.completion.observed import encode_box, observed_again
 from mstfilter.mst.completion.unet import ARCHITECTURE, CompletionNet
 from mstfilter.scene import Camera, Frame, VoxelGrid, frame_geometry, look_at, render, scene_cache
@@ -60,6 +68,29 @@ def test_crops_equal_the_rules_of_extrusion(frame):
         assert np.array_equal(x[0, 7].numpy() > 0, expected)
         known = np.isfinite(seen.signed)
         assert np.abs(4 * x[0, 5].numpy() - np.clip(seen.signed, -4, 4))[known].max() < 0.02
+
+
+def test_a_prior_is_a_channel(weights, completer, frame, tmp_path):
+    """With weights 0 for it, the network is the one without; with others, the kinds of the prior count."""
+    tensors = dict(open_model(weights, ARCHITECTURE).tensors)
+    masks, rng = masks_of(STACK, frame), np.random.default_rng(0)
+
+    def completed(weight: float, kinds: tuple[ShapeKind, ...]) -> list[np.ndarray]:
+        folder = tmp_path / str(weight)
+        stem = tensors["stem.weight"]
+        more = np.full((len(stem), 8, 3, 3, 3), weight, stem.dtype)
+        write_model(
+            folder,
+            describe(channels=[*CHANNELS, PRIOR]),
+            {**tensors, "stem.weight": np.concatenate([stem, more], axis=1)},
+        )
+        of = NetworkCompleter(weights=str(folder), log_odds=0.0, prior=Posterior(kinds=kinds, n=32))
+        return [one.probability for one in of.complete(rng, frame, masks, GRID)]
+
+    for found, one in zip(completed(0, (BoxKind(),)), completer.complete(rng, frame, masks, GRID), strict=True):
+        np.testing.assert_allclose(found, one.probability, atol=1e-5)
+    boxes, balls = (completed(0.1, (kind,)) for kind in (BoxKind(), EllipsoidKind()))
+    assert all(np.abs(a - b).max() > 0.01 for a, b in zip(boxes, balls, strict=True))
 
 
 def test_crops_stand_on_the_table_and_stay_in_the_grid():

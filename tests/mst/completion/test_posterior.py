@@ -83,6 +83,15 @@ def test_distances_have_the_sign_of_the_equation(kind, shape):
     assert np.array_equal((found < 0)[clear], inside_of(kind, half, np.array(shape), x)[clear])
 
 
+def test_far_points_are_far_from_a_small_superquadric():
+    """Powers of up to 8 of single-precision numbers do not overflow."""
+    half, shape = np.full((3, 1), 0.004, np.float32), np.ones((2, 1), np.float32)  # nearly a cube
+    x = np.array([[0.8, 0.1, 0.05], [-0.7, 0.7, -0.6], [0, 0, 1]], np.float32).T
+    with np.errstate(all="raise", under="ignore"):
+        found = SuperquadricKind().distance(half, shape, x[..., None])[:, 0]
+    assert (found > 0.5).all() and (found < 1.5).all()
+
+
 def test_a_vessel_is_hollow_and_open_at_the_top():
     half, wall = np.array([[0.04], [0.04], [0.05]], np.float32), 0.006
     shape = np.array([[0.7 / 0.75], [0.0], [0.5], [0.0]], np.float32)  # straight, with a wall of 6 mm
