@@ -6,7 +6,9 @@ through faces, prints and edges. So each division is described by
 
 - the `FEATURES` of the pair of its sides, as those that the tree merges;
 - `SEAM_FEATURES`: how the evidence runs along the seam, how well the sides fit to each other, whether the region or
-  its sides are the more compact, and what the tree says of the most similar of its own merges;
+  its sides are the more compact, what the tree says of the most similar of its own merges, and by which angle the
+  upright faces of one side are turned against those of the other (parts of one thing are parallel, things that were
+  set down beside each other hardly ever);
 - a *strip*: an image of `STRIP` pixels that follows the seam, in `STRIP_CHANNELS`.
 
 >>> measures = SeamMeasures.of(image)
@@ -25,7 +27,7 @@ from mstfilter.mst.segmentation.boundary import filled_disparity
 from mstfilter.mst.segmentation.divisions import KINDS, Division, SeamImage
 from mstfilter.mst.segmentation.pair_measures import FEATURES, pair_features
 from mstfilter.mst.segmentation.regions import BORDER_SIGN, REGION, border_terms, edge_maps, pixel_terms
-from mstfilter.scene import scaled_length
+from mstfilter.scene import posed_camera, scaled_length
 
 STRIP = (64, 24)  #: pixels along and across the seam
 #: Channels of a strip: the two sides; other objects; whether there is a reading; boundary map; log odds of a border;
@@ -42,10 +44,14 @@ SEAM_FEATURES = (
     *("step along", "top gap", "bottom gap", "near end", "far end"),
     *("hull gain", "solid region", "solid sides", "ground hull gain", "rectangle gain"),
     *("tree overlap", "tree odds", "divided above"),
+    *("turn", "flat faces", "face pixels"),
 )
 _LEVELS = 128.0  # a strip stores x as rint(x * 64) + 128, so -2 .. 1.98 in 256 levels
 _REACH = 1.3  # a strip is so many times as long as its seam
 _NEAR = 0.025  # metres from the plane within which the ends of the sides are compared
+_FACE = 4.0  # pixels of an image of 640 x 480, blur of the slopes from which normals are found
+_FLAT, _AWAY = 0.25, 3.0  # strength of the curvature of a face, and pixels of such an image to what is no face
+_MOST_TURN = 12.0  # degrees
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +64,7 @@ class SeamMeasures:
     smooth: np.ndarray  #: (H, W)
     terms: np.ndarray  #: (p, C) of the pixels of objects with a reading, with the heights
     term_of: np.ndarray  #: (H, W) row of `terms`, -1 for none
+    faces: np.ndarray  #: (H, W) complex, see `_upright_faces`
 
     @classmethod
     def of(cls, image: SeamImage, objects: np.ndarray) -> SeamMeasures:
@@ -68,7 +75,8 @@ class SeamMeasures:
         terms[np.arange(len(bins)), REGION["heights"].start + bins] = 1
         term_of = np.full(objects.shape, -1)
         term_of[at] = np.arange(len(bins))
-        return cls(image, objects, maps, smooth, terms, term_of)
+        flat = objects & image.frame.valid & (np.maximum(maps[..., 1], maps[..., 2]) < _FLAT)
+        return cls(image, objects, maps, smooth, terms, term_of, _upright_faces(image, smooth, flat))
 
     @cached_property
     def _channels(self) -> list[list[np.ndarray]]:
@@ -113,6 +121,31 @@ class SeamMeasures:
         return x.astype(np.float32), strips
 
 
+def _upright_faces(image: SeamImage, smooth: np.ndarray, flat: np.ndarray) -> np.ndarray:
+    """How upright faces are turned about the vertical: (H, W) complex, ``w exp(4 i angle)``.
+
+    The angle is that of the horizontal part of the surface normal. Faces at right angles count alike, so a sum over
+    the pixels of a box has the angle of the box. The weight w, 0 to 1, is small where a face is not upright, and 0 at
+    bends and borders, which are pixels that are not `flat` (H, W) and those beside them. The normal follows from the
+    gradient of the `smooth` disparity (H, W), which is linear on a plane.
+    """
+    camera, width = posed_camera(image.frame), flat.shape[1]
+    reach = 2 * max(1, round(scaled_length(_AWAY, width))) + 1
+    trusted = cv2.erode((flat & (image.evidence < 0.5)).astype(np.float32), np.ones((reach, reach), np.uint8))
+    sigma = scaled_length(_FACE, width)
+    mass = cv2.GaussianBlur(trusted, (0, 0), sigma)
+    x, y = (
+        cv2.GaussianBlur(trusted * cv2.Sobel(smooth, cv2.CV_32F, *axis) / 8, (0, 0), sigma) / np.maximum(mass, 1e-3)
+        for axis in ((1, 0), (0, 1))
+    )
+    x, y, rays = x * camera.K[0, 0], y * camera.K[1, 1], camera.rays()
+    normal = np.stack([x, y, smooth - x * rays[..., 0] - y * rays[..., 1]], axis=-1)
+    normal = normal @ camera.pose.rotation.as_matrix().T
+    across = normal[..., 0] + 1j * normal[..., 1]
+    upright = np.abs(across) / np.maximum(np.linalg.norm(normal, axis=-1), 1e-9)
+    return np.asarray(trusted * upright**6 * (across / np.maximum(np.abs(across), 1e-12)) ** 4)
+
+
 class _Region:
     """The pixels of one region with their terms, and the pairs of neighbouring pixels in it."""
 
@@ -127,6 +160,7 @@ class _Region:
         self.read = which >= 0
         self.terms = measures.terms[which[self.read]]
         self.points = self.image.points.reshape(-1, 3)[pixels[self.read]]
+        self.faces = measures.faces.ravel()[pixels]
         self.pairs = []
         self.outside = np.zeros(len(pixels))  # number of neighbours outside the region
         for axis in (0, 1):
@@ -208,6 +242,7 @@ class _Region:
                     float(np.log(all_ground / max(hulls[:, 1].sum(), 1e-6))),
                     float(np.log(all_box / max(hulls[:, 2].sum(), 1e-6))),
                     *(division.overlap, division.odds, float(below)),
+                    *self._turn(side),
                 ]
             )
         return np.array(rows)
@@ -248,6 +283,15 @@ class _Region:
         gaps = 100 * (np.array(ends[0]) - ends[1])
         up = 100 * (np.array(heights[0]) - heights[1])
         return np.clip(np.abs([gaps[1], up[2], up[0], gaps[0], gaps[2]]), 0, 6).tolist()
+
+    def _turn(self, side: np.ndarray) -> list[float]:
+        """Angle in degrees between faces of the sides, how well they agree (0 to 1), and log of their pixels."""
+        parts = [self.faces[one] for one in (side, ~side)]
+        weights = [float(np.abs(part).sum()) for part in parts]
+        a, b = (part.sum() / max(weight, 1e-9) for part, weight in zip(parts, weights, strict=True))
+        turn = np.rad2deg(abs(np.angle(a * np.conj(b)))) / 4
+        pixels = min(weights) / scaled_length(1, self.index.shape[1]) ** 2
+        return [min(turn, _MOST_TURN), abs(a * b), float(np.log1p(pixels))]
 
     def strip(self, division: Division) -> np.ndarray:
         """The strip (c, *STRIP) uint8 of a division."""

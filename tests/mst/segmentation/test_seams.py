@@ -8,17 +8,18 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings, strategies as st
+from scipy.spatial.transform import Rotation
 
 from mstfilter.base.errors import InputError
 from mstfilter.base.trained import write_model
 from mstfilter.mst.segmentation import ColourDepthBoundary, MergeLogOdds, SeamTree, SeenBorders, optimal_cut
-from mstfilter.mst.segmentation.divisions import SeamImage, TreePart, divisions
+from mstfilter.mst.segmentation.divisions import Division, SeamImage, TreePart, divisions
 from mstfilter.mst.segmentation.pair_measures import FEATURES, pair_features
 from mstfilter.mst.segmentation.regions import measure_regions
 from mstfilter.mst.segmentation.seam_measures import SEAM_FEATURES, STRIP, STRIP_CHANNELS, SeamMeasures
 from mstfilter.mst.segmentation.seam_network import INPUTS, SEAM_ARCHITECTURE, SeamNet
 from mstfilter.mst.segmentation.seams import BaseTree, SharedPrior, _Examination, _Judged
-from mstfilter.scene import Frame, pixels_above_table, render
+from mstfilter.scene import Camera, Frame, look_at, pixels_above_table, render
 from tests.mst.segmentation.scenes import GRID, boxes, camera, frame_of
 
 ROW = boxes(((20, 20, 0), (32, 34, 10)), ((32, 20, 0), (46, 34, 10)))
@@ -99,6 +100,37 @@ def test_strips_follow_the_seam(touching):
     first, second = (strips[0, k].astype(float) - 128 for k in (0, 1))
     left, right = np.s_[16:48, :11], np.s_[16:48, 13:]
     assert first[left].mean() > 5 * first[right].mean() and second[right].mean() > 5 * second[left].mean()
+
+
+def pair_of_boxes(turn: float, noise: float) -> tuple[Frame, np.ndarray]:
+    """A frame of two boxes, side by side, the second one turned by so many degrees, and the objects (H, W)."""
+    view = Camera.from_intrinsics(525, 525, 319.5, 239.5, 640, 480, look_at((0.25, -0.75, 0.4), (0.0, 0.0, 0.05)))
+    rays = view.rays() @ view.pose.rotation.as_matrix().T
+    depth = np.where(rays[..., 2] < -0.1, -view.position[2] / np.minimum(rays[..., 2], -0.1), 3.0)  # of the table
+    labels = np.zeros(depth.shape, int)
+    for k, (x, angle) in enumerate(((-0.05, 0.0), (0.05, turn)), start=1):
+        to_box = Rotation.from_euler("z", -angle, degrees=True).as_matrix()
+        start, along = to_box @ (view.position - (x, 0.0, 0.06)), rays @ to_box.T
+        near, far = (((side * np.array([0.047, 0.03, 0.06]) - start) / along) for side in (-1, 1))
+        enter, leave = np.minimum(near, far).max(axis=-1), np.maximum(near, far).min(axis=-1)
+        hit = (enter < leave) & (enter < depth)
+        depth, labels = np.where(hit, enter, depth), np.where(hit, k, labels)
+    readings = depth + np.random.default_rng(0).normal(0.0, noise, depth.shape) * depth**2
+    return Frame(np.zeros((*depth.shape, 3), np.uint8), readings.astype(np.float32), view), labels
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.003])
+def test_the_turn_of_faces_is_measured(noise):
+    """To a degree, also with the noise of a depth camera."""
+    for turn in (0.0, 3.0, 8.0):
+        frame, labels = pair_of_boxes(turn, noise)
+        image = SeamImage.of(frame, ColourDepthBoundary().boundary(frame), blind(frame))
+        pixels = np.flatnonzero(labels > 0)
+        measures = SeamMeasures.of(image, labels > 0)
+        x, _ = measures.describe(pixels, [Division(labels.ravel()[pixels] == 1, "tree", np.zeros(3), 0.0, 0.0, 0.0)])
+        found = dict(zip(SEAM_FEATURES, x[0, len(FEATURES) :], strict=True))
+        assert found["turn"] == pytest.approx(turn, abs=0.5 if not noise else 1.0)
+        assert found["flat faces"] > 0.5 and found["face pixels"] > 6
 
 
 def write_judge(folder, bias):
