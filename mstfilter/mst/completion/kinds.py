@@ -58,6 +58,18 @@ class ShapeKind(Bounded, ABC):
         """Thickness (n,) of the thinnest wall or of the shape, metres."""
         return 2 * half.min(axis=0)
 
+    def log_weight(self, half: np.ndarray, shape: np.ndarray) -> np.ndarray:
+        """What you know of sizes and shapes besides what is seen: nats (n,) that a candidate gains. None by default.
+
+        If all boxes on the table have edges of 8, 6 and 4 cm:
+
+        >>> class MyBoxes(BoxKind):
+        ...     def log_weight(self, half, shape):
+        ...         off = np.sort(half, axis=0) - np.array([[0.02], [0.03], [0.04]])
+        ...         return -0.5 * ((off / 0.002) ** 2).sum(axis=0)  # known to 2 mm
+        """
+        return np.zeros(half.shape[1], np.float32)
+
 
 @dataclass(frozen=True)
 class BoxKind(ShapeKind):

@@ -196,7 +196,8 @@ class Posterior(OnLattice):
         boxes, found = groups.boxes(group, u[:, order]), np.empty(len(order))
         for k in np.unique(kinds):
             part = slice(*np.searchsorted(kinds, (k, k + 1)))
-            found[order[part]] = self._log_likelihood(evidence, self.kinds[k], boxes.take(part))
+            kind, own = self.kinds[k], boxes.take(part)
+            found[order[part]] = self._log_likelihood(evidence, kind, own) + kind.log_weight(own.half, own.shape)
         off = (boxes.lowest(groups.round[group]) - groups.support[group]) / _REST
         foot = np.array([kind.foot for kind in self.kinds])[kinds] * boxes.half[:2].min(axis=0)
         narrow = np.maximum(np.log(_SLENDER * boxes.half[2] / foot), 0)

@@ -298,6 +298,15 @@ class ShapeKindContract(StageContract):
         )
         assert (within < 0).any(axis=0).all(), "a shape contains none of 500 points of its box"
 
+    def test_log_weights_are_numbers(self) -> None:
+        """`log_weight` returns a finite number for each candidate."""
+        kind, rng = self.make(), seeded(0)
+        half, shape = rng.uniform(0.002, 0.2, (3, 40)), rng.random((kind.n_shape, 40))
+        with skips_errors():
+            found = np.asarray(kind.log_weight(half.astype(np.float32), shape.astype(np.float32)))
+        assert found.shape == (40,), f"the log weights have shape {found.shape}, expected (40,)"
+        assert np.isfinite(found).all(), "some log weights are not finite: use -1e4 for what cannot be"
+
 
 class RegistrationContract(StageContract):
     """The contract of every `Registration`."""

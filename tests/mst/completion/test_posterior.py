@@ -30,7 +30,7 @@ from mstfilter.mst.completion.posterior import SHAPE_KINDS
 from mstfilter.mst.testing.stages import ShapeKindContract
 from mstfilter.scene import Frame, VoxelGrid
 from tests.mst.completion.test_completion import masks_of
-from tests.mst.segmentation.scenes import GRID, TWO, frame_of
+from tests.mst.segmentation.scenes import GRID, TWO, boxes, frame_of
 
 ALL_KINDS = (
     *(BoxKind(), CylinderKind(), ConeKind(), TurnedKind()),
@@ -44,6 +44,7 @@ QUICK = Posterior(n=64)
 def test_kinds_keep_their_contract(kind):
     contract = type("Contract", (ShapeKindContract,), {"make": staticmethod(lambda: kind)})
     contract().test_distance_is_metric()
+    contract().test_log_weights_are_numbers()
 
 
 def inside_of(kind: ShapeKind, half: np.ndarray, shape: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -185,6 +186,29 @@ class _Nowhere(ShapeKind):
 
     def distance(self, half: np.ndarray, shape: np.ndarray, x: np.ndarray) -> np.ndarray:
         return np.sqrt((x**2).sum(axis=0)) - 0.001
+
+
+@dataclass(frozen=True)
+class _KnownBoxes(BoxKind):
+    """Boxes whose edges are known."""
+
+    edges: tuple[float, ...] = ()
+
+    def log_weight(self, half: np.ndarray, shape: np.ndarray) -> np.ndarray:
+        off = 2 * np.sort(half, axis=0) - np.sort(self.edges)[:, None]
+        return -0.5 * ((off / 0.004) ** 2).sum(axis=0)
+
+
+def test_known_sizes_decide_what_is_not_seen():
+    """The far side of a box is hardly seen, so how deep it is follows from what is said to be known."""
+    _, seen = seen_of(boxes(((20, 20, 0), (32, 32, 8))))
+    volumes = []
+    for deep in (0.12, 0.16):
+        known = Posterior(kinds=(_KnownBoxes(edges=(deep, 0.12, 0.08)),), misfit=0.0)
+        drawn = known.sample(np.random.default_rng(0), seen)
+        np.testing.assert_allclose(2 * np.sort(drawn.boxes.half, axis=0).mean(axis=1), (0.08, 0.12, deep), atol=0.008)
+        volumes.append(drawn.occupancy().sum())
+    assert volumes[1] > 1.15 * volumes[0]
 
 
 def test_what_no_kind_fits_is_extruded():
