@@ -2,12 +2,14 @@
 
     python experiments/completion/meshes.py make --out FOLDER [--scenes 40]     # needs MSTFILTER_OBJECTS; resumable
     python experiments/completion/meshes.py score --out FOLDER [--results experiments/completion/results/meshes]
+    python experiments/completion/meshes.py score --out FOLDER --also mine=WEIGHTS --results FOLDER  # other weights
 
 `make` writes one file a scene with the crops of its masks: scenes of the families m1, m2 and m3 at rest, seen by one
-camera each, whose height and distance vary. The objects are those of the tuning pool, on which no network was
-trained. The masks are true ones with displaced borders, and segments of sampled cuts of the segmentation tree, which
-also hold parts of objects, and several objects. `score` completes the crops and writes two tables: IoU, log loss,
-calibration, volume and surface distance by completer and group, and differences from the network, paired by scene.
+camera each, whose height and distance vary. The objects are those of the tuning pool, or with --reported those of the
+reported pool; no network was trained on either. The masks are true ones with displaced borders, and segments of sampled
+cuts of the segmentation tree, which also hold parts of objects, and several objects. `score` completes the crops and
+writes two tables: IoU, log loss, calibration, volume and surface distance by completer and group, and differences from
+the network, paired by scene.
 """
 
 from __future__ import annotations
@@ -78,8 +80,7 @@ class _Crop(Extrude):
 
 
 def make_scene(family: str, seed: int) -> list[MeshSample]:
-    """The samples of a scene of the tuning pool."""
-    assert seed < FIRST_REPORTED_SEED
+    """The samples of a scene."""
     rng = np.random.default_rng([seed, FAMILIES.index(family)])
     changes = {"camera_distance": float(rng.uniform(0.6, 1.15)), "camera_higher": float(rng.uniform(-18, 22))}
     scene = SimulatedScene(replace(scene_family(family), n_actions=0, arm=False, supersample=False, **changes), seed)
@@ -162,11 +163,11 @@ def _surface_points(rng: np.random.Generator, shape: Shape, pose: np.ndarray) ->
     return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])
 
 
-def make(out: Path, n_scenes: int) -> None:
-    """Write the missing files of scenes."""
+def make(out: Path, n_scenes: int, first: int) -> None:
+    """Write the missing files of scenes with seeds from `first` on."""
     out.mkdir(parents=True, exist_ok=True)
     for k in range(n_scenes):
-        family, seed = FAMILIES[k % len(FAMILIES)], k // len(FAMILIES)
+        family, seed = FAMILIES[k % len(FAMILIES)], first + k // len(FAMILIES)
         path = out / f"{family}-{seed}.npz"
         if path.exists():
             continue
@@ -252,12 +253,13 @@ def groups_of_masks(samples: Sequence[MeshSample]) -> dict[str, np.ndarray]:
     return groups | {"scans": whole & (source == "urdf_models")}
 
 
-def score(out: Path, results: Path) -> None:
-    """Complete all samples and write the tables."""
+def score(out: Path, results: Path, also: dict[str, str]) -> None:
+    """Complete all samples and write the tables. `also` has the weights of further networks by name."""
     completers: dict[str, Completer] = {
         "extrude": Extrude(),
         "network": NetworkCompleter(log_odds=0.0),
         "posterior": Posterior(),
+        **{name: NetworkCompleter(weights=weights, log_odds=0.0) for name, weights in also.items()},
     }
     samples: list[MeshSample] = []
     said: dict[str, list[tuple[np.ndarray, float]]] = {name: [] for name in completers}
@@ -341,11 +343,13 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--scenes", type=int, default=48)
     parser.add_argument("--results", type=Path, default=HERE / "results" / "meshes")
+    parser.add_argument("--reported", action="store_true", help="scenes with objects of the reported pool")
+    parser.add_argument("--also", action="append", default=[], metavar="NAME=WEIGHTS", help="a further network")
     options = parser.parse_args()
     if options.what == "make":
-        make(options.out, options.scenes)
+        make(options.out, options.scenes, FIRST_REPORTED_SEED if options.reported else 0)
     else:
-        score(options.out, options.results)
+        score(options.out, options.results, dict(text.split("=", 1) for text in options.also))
 
 
 if __name__ == "__main__":
