@@ -6,10 +6,10 @@
 
 `make` writes one file a scene with the crops of its masks: scenes of the families m1, m2 and m3 at rest, seen by one
 camera each, whose height and distance vary. The objects are those of the tuning pool, or with --reported those of the
-reported pool; no network was trained on either. The masks are true ones with displaced borders, and segments of sampled
-cuts of the segmentation tree, which also hold parts of objects, and several objects. `score` completes the crops and
-writes two tables: IoU, log loss, calibration, volume and surface distance by completer and group, and differences from
-the network, paired by scene.
+reported pool; no network was trained on either. The masks are true ones with displaced borders, and segments of
+sampled cuts of the segmentation tree, which also hold parts of objects, and several objects. `score` completes the
+crops and writes two tables: IoU, log loss, calibration, volume and surface distance by completer and group, and
+differences from the network, paired by scene.
 """
 
 from __future__ import annotations
