@@ -346,7 +346,7 @@ def _main_part(seen: ObservedBox) -> np.ndarray:
     part, n = label(seen.surface, np.ones((3, 3, 3)))
     size = np.bincount(part.ravel(), minlength=n + 1)
     size[0] = 0
-    kept = (size >= _LEAST_PART * size.sum())[part]
+    kept = (size >= min(_LEAST_PART * size.sum(), size.max()))[part]  # of many equal parts, all are kept
     top = seen.height[np.flatnonzero(kept.any(axis=(0, 1)))[-1]]
     voxel = seen.voxel_size
     above = kept & (seen.height > voxel)

@@ -241,6 +241,16 @@ def test_views_count_if_they_show_much_that_the_latest_frame_does_not():
     assert np.array_equal(QUICK.fill(RNG, hidden), QUICK.fill(RNG, seen))
 
 
+def test_a_surface_in_small_pieces_is_an_object():
+    """As of a grating, or of what is seen through a net: no piece is large."""
+    _, seen = seen_of(cast(0.055, 0.12)[0])
+    kept = np.zeros(seen.surface.shape, bool)
+    kept[::3, ::3, ::3] = True
+    pieces = replace(seen, surface=seen.surface & kept)
+    assert pieces.surface.sum() > 10
+    assert (QUICK.fill(RNG, pieces) >= 0.5).any()
+
+
 def test_tiny_and_empty_boxes():
     nothing = np.zeros((3, 3, 3), bool)
     empty = ObservedBox(nothing * 0, *[nothing] * 5, nothing * 0.0, np.arange(3) * 0.01 + 0.005)
