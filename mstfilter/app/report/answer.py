@@ -134,10 +134,9 @@ class Answer:
         if hidden:
             names = _listed([f"{one.number} ({share(one.existence)})" for one in hidden])
             found.append(f"{len(hidden)} {'is' if len(hidden) == 1 else 'are'} hidden and remembered: {names}.")
-        n = len(self.borders)
-        if n:
-            texts = [f"{border.text} ({share(border.one_object)})" for border in self.borders]
-            texts[0] = texts[0].replace(")", " that both sides are one object)")
+        if self.borders:
+            texts = self._open_borders()
+            n = len(texts)
             found.append(f"{n} border{' is' if n == 1 else 's are'} open: {_listed(texts)}.")
         else:
             found.append("No border is open.")
@@ -147,6 +146,23 @@ class Answer:
             listed = _listed([f"{one.number} ({share(one.several)})" for one in parts])
             found.append(f"Perhaps several objects, with something between them: {listed}.")
         return found
+
+    def _open_borders(self) -> list[str]:
+        """The open borders in words. Several between the same two objects are places where these may meet."""
+        places: dict[str, list[float]] = {}
+        for border in self.borders:
+            places.setdefault(border.text, []).append(border.one_object)
+        texts = []
+        for text, one in places.items():
+            if len(one) == 1 or not text.startswith("between"):
+                texts += [f"{text} ({share(p)})" for p in one]
+            else:
+                there = " or ".join(share(1 - p) for p in sorted(one))
+                texts.append(f"{text}, which meet at one of {len(one)} places ({there})")
+        first = next((k for k, text in enumerate(texts) if "which meet" not in text), None)
+        if first is not None:
+            texts[first] = texts[first].replace(")", " that both sides are one object)")
+        return texts
 
 
 @matplotlib.style.context("mstfilter.app.report.figures")

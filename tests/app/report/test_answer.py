@@ -43,6 +43,20 @@ def test_sentences_and_borders_of_two_readings():
     assert x.min() - 4 < drawn[:, 0].min() and drawn[:, 0].max() < x.max() + 4
 
 
+def test_two_borders_of_one_pair_are_two_places():
+    """Two objects touch, and it is open where one ends: .81 at one place, .19 at another."""
+    answer = answer_of(two_readings(p_one=0.25))
+    [border] = answer.borders
+    a, b = border.numbers
+    twice = replace(answer, borders=(replace(border, one_object=0.19), replace(border, one_object=0.81)))
+    text = f"between objects {a} and {b}, which meet at one of 2 places (.81 or .19)"
+    assert twice.sentences[-1] == f"1 border is open: {text}."
+    inside = replace(border, one_object=0.5, numbers=(a,))
+    both = replace(twice, borders=(*twice.borders, inside))
+    that = f"inside object {a} (.50 that both sides are one object)"
+    assert both.sentences[-1] == f"2 borders are open: {text}, {that}."
+
+
 def test_outlines_are_those_of_the_objects():
     belief = two_readings()
     table = belief.objects()
