@@ -44,6 +44,7 @@ class CompletionTraining(Training):
     prior: bool = True  #: the mean of `Posterior` is a channel
     objects: str = ""  #: folder of meshes; none if empty
     n_large: int = 200  #: further scenes for training, with larger objects
+    stretch: float = 0.3  #: crops are stretched by up to exp(stretch), in height by up to another exp(stretch / 2)
     large: float = 0.2  #: share of the batches with crops of larger objects; they have as many voxels as others
 
     recipes: ClassVar[Mapping[str, Mapping[str, Any]]] = {
@@ -102,12 +103,12 @@ class CompletionTraining(Training):
                     n = max(self.batch * EDGE**3 // size**3, 1)
                     of, edge, chosen = larger, size, rng.choice(fits, n)
             cut = (slice(edge),) * 3
-            turns = rng.integers(8, size=len(chosen))
-            columns = (
-                [_turned(values[i][cut], t) for i, t in zip(chosen, turns, strict=True)]
-                for values in (of.bits, of.signed, of.prior, of.truth)
-            )
-            yield tuple(torch.from_numpy(np.stack(column)) for column in columns)
+            rows = []
+            for i in chosen:
+                symmetry = int(rng.integers(8))
+                crops = [values[i][cut] for values in (of.bits, of.signed, of.prior, of.truth)]
+                rows.append([_turned(one, symmetry) for one in _stretched(rng, crops, self.stretch)])
+            yield tuple(torch.from_numpy(np.stack(column)) for column in zip(*rows, strict=True))
 
     def loss(
         self, networks: Mapping[str, Any], step: int, batch: Sequence[Tensor]
@@ -154,6 +155,21 @@ def _extents(bits: np.ndarray) -> np.ndarray:
     used = [np.any(bits, axis=tuple(a for a in (1, 2, 3) if a != axis)) for axis in (1, 2, 3)]
     last = [np.argmax(np.flip(one, axis=1), axis=1) for one in used]
     return np.asarray(bits.shape[-1] - np.min(last, axis=0))
+
+
+def _stretched(rng: np.random.Generator, crops: Sequence[np.ndarray], stretch: float) -> list[np.ndarray]:
+    """Flags, distances, prior and truth (e, e, e) of another shape: stretched about the middle, and upwards.
+
+    A linear map keeps rays straight, so the stretched view is what another camera sees of the stretched scene.
+    """
+    across = np.exp(rng.uniform(-stretch, stretch))
+    up = across * np.exp(rng.uniform(-stretch, stretch) / 2)
+    edge = len(crops[0])
+    place = np.arange(edge) + 0.5
+    level = np.clip((place - edge / 2) / across + edge / 2, 0, edge - 1).astype(int)
+    index = np.ix_(level, level, np.clip(place / up, 0, edge - 1).astype(int))
+    bits, signed, *others = (values[index] for values in crops)
+    return [bits, np.clip(np.rint(signed * across), -127, 127).astype(np.int8), *others]
 
 
 def _turned(values: np.ndarray, symmetry: int) -> np.ndarray:

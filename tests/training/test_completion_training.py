@@ -11,7 +11,7 @@ import pytest
 import torch
 import trimesh
 
-from mst_training import completion_data
+from mst_training import completion, completion_data
 from mst_training.completion import CompletionTraining
 from mst_training.completion_data import CompletionSamples, LargeSamples
 from mst_training.loop import run_training
@@ -87,7 +87,7 @@ def test_larger_objects_are_whole_and_in_batches_of_their_own(samples):
     extents = [np.ptp(np.argwhere(bits), axis=0).max() + 1 for bits in large.bits]
     assert min(extents) > 32
     steps = 40
-    settings = replace(SMALL, large=0.5, batch=16, steps=steps)
+    settings = replace(SMALL, large=0.5, stretch=0.0, batch=16, steps=steps)
     counts: dict[int, int] = {}
     for bits, signed, prior, truth in settings.batches((samples, large), 0, steps):
         n, edge = bits.shape[:2]
@@ -99,6 +99,23 @@ def test_larger_objects_are_whole_and_in_batches_of_their_own(samples):
             assert np.isin(found, large.bits.sum(axis=(1, 2, 3))).all()
     assert 10 <= counts[32] <= 30 and counts[64] >= 3  # of 40, false alarms below .002
     assert (48 in counts) == (min(extents) <= 48)
+
+
+def test_stretched_crops_show_stretched_shapes():
+    """A ball becomes an ellipsoid whose semi-axes are in the two ratios, with its flags and distances."""
+    at = np.indices((48,) * 3) + 0.5
+    inside = (at[0] - 24) ** 2 + (at[1] - 24) ** 2 + (at[2] - 8) ** 2 < 7.5**2
+    crops = [np.where(inside, Seen.BEHIND, Seen.FREE), np.where(inside, 40, 0), 255 * inside, inside]
+    crops = [values.astype(kind) for values, kind in zip(crops, (np.uint8, np.int8, np.uint8, bool), strict=True)]
+    rng, ratios = np.random.default_rng(0), []
+    for _ in range(20):
+        bits, signed, prior, truth = completion._stretched(rng, crops, 0.3)
+        assert np.array_equal(truth, prior == 255) and np.array_equal(truth, Seen.BEHIND.among(bits) > 0)
+        wide, _, high = (np.ptp(np.argwhere(truth), axis=0) + 1) / 15
+        ratios.append((wide, high / wide))
+        assert np.abs(signed[truth] - 40 * wide).max() < 6 and not signed[~truth].any()
+    low, high = np.min(ratios, axis=0), np.max(ratios, axis=0)
+    assert 0.7 < low[0] < 0.85 and 1.15 < high[0] < 1.42 and 0.75 < low[1] < 0.95 and 1.05 < high[1] < 1.3
 
 
 def test_meshes_are_among_the_objects(tmp_path, monkeypatch):
