@@ -337,6 +337,7 @@ class _Matching:
         merges = (shared > 0.5 * of_row).sum(axis=1, keepdims=True) > 1  # it has most of two rows
         splits = ((shared > 0.5 * of_own) & (of_own > _PART * of_row)).sum(axis=0) > 1  # the row has two such objects
         table = np.where(merges | splits, 0, self.jaccard[np.ix_(numbers, columns)])
+        table[np.equal.outer(numbers, columns)] = 1  # a row is its own object, also if it has most of two others
         pairs = zip(*linear_sum_assignment(-table), strict=True)
         return {own[a]: int(r) for a, r in pairs if table[a, r] >= _SAME}
 

@@ -102,6 +102,16 @@ def test_an_object_that_only_others_have():
     assert at(twice, HIDDEN).existence == pytest.approx(0.4) and at(twice, FAR).existence == pytest.approx(0.2)
 
 
+def test_a_row_that_has_most_of_two_others():
+    """Two small objects of one hypothesis are parts of a large one of another, and the estimate has none of them."""
+    small, other = np.s_[16:18, 26:30, :4], np.s_[18:20, 26:30, :4]
+    large = np.s_[10:30, 24:36, :8]
+    table = belief_of((0.6, scene(LEFT)), (0.25, scene(LEFT, small, other)), (0.15, scene(LEFT, large))).objects()
+    assert len(table) == 4
+    assert at(table, large).volume == pytest.approx(20 * 12 * 8 * 1e-6)
+    assert at(table, small).existence == pytest.approx(0.4, abs=1e-6)  # as a part of the large one
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_nothing_depends_on_labels_or_order(seed):
     rng = np.random.default_rng(seed)
