@@ -233,11 +233,6 @@ def surface_distances(p: np.ndarray, surface: np.ndarray) -> tuple[float, float]
     return 500 * float(there.mean() + back.mean()), float((there < NEAR).mean() + (back < NEAR).mean()) / 2
 
 
-def shifted(p: np.ndarray, log_odds: float) -> np.ndarray:
-    odds = np.exp(log_odds) * p
-    return np.asarray(odds / (odds + 1 - p), np.float32)
-
-
 def groups_of_masks(samples: Sequence[MeshSample]) -> dict[str, np.ndarray]:
     """Masks (n,) bool of each group. Groups by object have masks of whole objects only."""
     _, mask, kind, _, source, length, visible = np.array([one.about for one in samples]).T
@@ -257,9 +252,10 @@ def score(out: Path, results: Path, also: dict[str, str]) -> None:
     """Complete all samples and write the tables. `also` has the weights of further networks by name."""
     completers: dict[str, Completer] = {
         "extrude": Extrude(),
-        "network": NetworkCompleter(log_odds=0.0),
+        "network": NetworkCompleter(),
+        "generated": NetworkCompleter(weights="completion_generated"),
         "posterior": Posterior(),
-        **{name: NetworkCompleter(weights=weights, log_odds=0.0) for name, weights in also.items()},
+        **{name: NetworkCompleter(weights=weights) for name, weights in also.items()},
     }
     samples: list[MeshSample] = []
     said: dict[str, list[tuple[np.ndarray, float]]] = {name: [] for name in completers}
@@ -274,11 +270,8 @@ def score(out: Path, results: Path, also: dict[str, str]) -> None:
     found = {name: [p for p, _ in of_all] for name, of_all in said.items()}
     pairs = zip(said["posterior"], found["extrude"], strict=True)
     found["posterior"] = [fits * p + (1 - fits) * otherwise for (p, fits), otherwise in pairs]
-    found["pooled"] = [Pooled().mean(both) for both in zip(said["network"], said["posterior"], strict=True)]
-    ms["pooled"] = [a + b for a, b in zip(ms["network"], ms["posterior"], strict=True)]
-    for name in ("network", "pooled"):
-        found[f"{name}, shifted"] = [shifted(p, NetworkCompleter().log_odds) for p in found[name]]
-        ms[f"{name}, shifted"] = ms[name]
+    found["pooled"] = [Pooled().mean(both) for both in zip(said["generated"], said["posterior"], strict=True)]
+    ms["pooled"] = [a + b for a, b in zip(ms["generated"], ms["posterior"], strict=True)]
     asked = [
         ~Seen.FREE.among(one.bits) & ((Seen.SURFACE | Seen.BEHIND).among(one.bits) | (np.max(p, axis=0) > ASKED))
         for one, *p in zip(samples, *found.values(), strict=True)

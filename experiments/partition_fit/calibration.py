@@ -1,4 +1,4 @@
-"""Fits `NetworkCompleter.log_odds` to tuning scenes.
+"""Which shift of the log odds of shapes (`OnLattice.log_odds`) fits tuning scenes best?
 
     python experiments/partition_fit/calibration.py [--seeds 5] [--smoke --out FOLDER]
 
@@ -23,7 +23,6 @@ from scipy.special import expit, logit
 import mstfilter
 from mstfilter.base.files import write_csv
 from mstfilter.lab.simulation import cached_recording
-from mstfilter.mst.completion import NetworkCompleter
 from mstfilter.scoring import ask
 from mstfilter.scoring.forecasts import SOFTENING, ForecastTable
 
@@ -79,11 +78,10 @@ def draw(scenes: list[dict[str, np.ndarray]], path: Path) -> None:
 
     plt.style.use("mstfilter.app.report.figures")
     figure, places = plt.subplots(1, 2, figsize=(8, 4.1), sharey=True, layout="constrained")
-    default = NetworkCompleter().log_odds
     for k, question in enumerate(("is this voxel occupied?", "do these two belong to one object?")):
         place = places[k]
         place.plot([0, 1], [0, 1], color=".6", lw=1)
-        for log_odds, marker in ((0.0, "o"), (default, "s")):
+        for log_odds, marker in ((0.0, "o"), (0.2, "s")):
             found = tables(scenes, log_odds)[k].reliability(15)
             label = f"added log odds {log_odds:g}: error {found.error:.3f}"
             place.plot(found.forecast, found.frequency, marker=marker, ms=4, label=label)

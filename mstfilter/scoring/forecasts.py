@@ -60,7 +60,7 @@ class ForecastTable:
             raise InputError("counts of forecasts are negative, infinite or NaN")
         values, which = np.unique(p, return_inverse=True)
         yes, no = (np.bincount(which, count * share, len(values)) for share in (y, 1 - y))
-        return cls(values, no, yes)
+        return cls(values, no.astype(np.float64), yes.astype(np.float64))  # of no forecasts, they are integers
 
     @classmethod
     def pooled(cls, tables: Sequence[ForecastTable]) -> ForecastTable:

@@ -64,3 +64,9 @@ def test_recalibration_is_the_best_monotone_map(pairs):
         ]
     )
     np.testing.assert_allclose(values, m, atol=1e-9)
+
+
+def test_tables_without_forecasts_can_be_pooled():
+    empty = ForecastTable.of([], [])
+    assert ForecastTable.pooled([empty, empty]).n == 0
+    assert ForecastTable.pooled([empty, ForecastTable.of([0.5], [1])]).n == 1

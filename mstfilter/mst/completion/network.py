@@ -11,13 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.ndimage import binary_dilation
 
 from mstfilter.base.errors import missing_library
-from mstfilter.base.fields import Bounds, Share
+from mstfilter.base.fields import Share
 from mstfilter.mst.completion.crops import BATCH, EDGE, LARGER, Architecture
 from mstfilter.mst.completion.extrude import Extrude
 from mstfilter.mst.completion.lattice import OnLattice
@@ -45,10 +45,6 @@ class NetworkCompleter(OnLattice, UsesFiles):
         Walls and plates that are thinner than a voxel contain the centres of few voxels, so the network removes much
         of their surface. If less than the share `least_surface` of a large visible surface survives, all of it is
         restored (p >= .5). With 0, none is.
-    log_odds : float
-        Added to the log odds of every voxel with a probability between 0 and 1, because the network is calibrated for
-        the masks of its training scenes and not for those of a filter. The default was fitted to runs of `mst`
-        (`experiments/partition_fit`).
     prior : Posterior
         The prior over whole shapes, whose mean is a channel of the package's network. A network without this channel
         does not use it.
@@ -58,7 +54,6 @@ class NetworkCompleter(OnLattice, UsesFiles):
 
     weights: str = "completion"
     least_surface: Share = 2 / 3
-    log_odds: Annotated[float, Bounds()] = 0.2
     prior: Posterior = Posterior()  # noqa: RUF009 (frozen)
     architecture: Architecture | None = None
 
