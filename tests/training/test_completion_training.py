@@ -244,7 +244,7 @@ def test_training_learns_resumes_and_is_used(files, tmp_path):
 
     run_script("completion/compare.py", tmp_path / "a", "--most", 6, "--out", tmp_path / "out")
     rows = {row["completer"]: row for row in read_csv(tmp_path / "out/completion.csv") if row["group"] == "all"}
-    assert len(rows) == 7 and float(rows["extrude"]["iou"]) > float(rows["surface"]["iou"])
+    assert len(rows) == 8 and float(rows["extrude"]["iou"]) > float(rows["surface"]["iou"])
 
     one = NetworkCompleter(weights=str(tmp_path / "a"))
     frame = frame_of(TWO, width=320)

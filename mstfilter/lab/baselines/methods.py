@@ -130,7 +130,7 @@ class Floor(Proposal):
 
     completer: Completer = field(default_factory=Extrude)
     objects: ObjectRule = field(default_factory=ObjectRule)
-    threshold: Share = 0.5
+    threshold: Share = 0.45
 
     properly_weighted: ClassVar[bool] = False
 

@@ -48,7 +48,7 @@ class MaskProposal(Proposal, UsesFiles):
     sampler: CutSampler = field(default_factory=lambda: ExactCuts(temperature=1.0))
     objects: ObjectRule = field(default_factory=ObjectRule)
     completer: Completer = field(default_factory=Extrude)
-    threshold: Share = 0.5
+    threshold: Share = 0.45
 
     properly_weighted: ClassVar[bool] = False
 

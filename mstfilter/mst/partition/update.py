@@ -177,7 +177,7 @@ class PartitionUpdate(Update):
     n_scored: PositiveInt = 20
     reach: NonNegativeFloat = 1.5
     n_views: NonNegativeInt = 4
-    threshold: Share = 0.5
+    threshold: Share = 0.45
     mend: bool = True
     least_agreement: Share = 0.7
 

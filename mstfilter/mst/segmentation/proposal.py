@@ -157,7 +157,7 @@ class TreeCutProposal(Proposal):
     objects: ObjectRule = field(default_factory=ObjectRule)
     completer: Completer = field(default_factory=Extrude)
     weight_rule: Literal["equal", "p"] = "equal"
-    threshold: Share = 0.5
+    threshold: Share = 0.45
 
     properly_weighted: ClassVar[bool] = False
 
