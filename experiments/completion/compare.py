@@ -69,8 +69,9 @@ def main() -> None:
         "extrude": Extrude(),
         "hull": Hull(),
         "hilbert_map": HilbertMap(),
-        "network": NetworkCompleter(weights=str(chosen.trained)),
-        "generated": NetworkCompleter(weights="completion_generated"),
+        "trained": NetworkCompleter(weights=str(chosen.trained)),
+        "network": NetworkCompleter(),
+        "prior": NetworkCompleter(weights="completion_prior"),
         "posterior": Posterior(),
         "pooled": Pooled(),
     }

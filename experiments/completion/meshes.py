@@ -253,7 +253,7 @@ def score(out: Path, results: Path, also: dict[str, str]) -> None:
     completers: dict[str, Completer] = {
         "extrude": Extrude(),
         "network": NetworkCompleter(),
-        "generated": NetworkCompleter(weights="completion_generated"),
+        "prior": NetworkCompleter(weights="completion_prior"),
         "posterior": Posterior(),
         **{name: NetworkCompleter(weights=weights) for name, weights in also.items()},
     }
@@ -270,8 +270,8 @@ def score(out: Path, results: Path, also: dict[str, str]) -> None:
     found = {name: [p for p, _ in of_all] for name, of_all in said.items()}
     pairs = zip(said["posterior"], found["extrude"], strict=True)
     found["posterior"] = [fits * p + (1 - fits) * otherwise for (p, fits), otherwise in pairs]
-    found["pooled"] = [Pooled().mean(both) for both in zip(said["generated"], said["posterior"], strict=True)]
-    ms["pooled"] = [a + b for a, b in zip(ms["generated"], ms["posterior"], strict=True)]
+    found["pooled"] = [Pooled().mean(both) for both in zip(said["network"], said["posterior"], strict=True)]
+    ms["pooled"] = [a + b for a, b in zip(ms["network"], ms["posterior"], strict=True)]
     asked = [
         ~Seen.FREE.among(one.bits) & ((Seen.SURFACE | Seen.BEHIND).among(one.bits) | (np.max(p, axis=0) > ASKED))
         for one, *p in zip(samples, *found.values(), strict=True)

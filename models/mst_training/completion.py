@@ -41,7 +41,7 @@ class CompletionTraining(Training):
     """Settings of the training of the completion network. A scene gives about 35 samples."""
 
     n_globals: int = 16  #: number of global features
-    prior: bool = True  #: the mean of `Posterior` is a channel
+    prior: bool = False  #: the mean of `Posterior` is a channel
     objects: str = ""  #: folder of meshes; none if empty
     n_large: int = 200  #: further scenes for training, with larger objects
     stretch: float = 0.3  #: crops are stretched by up to exp(stretch), in height by up to another exp(stretch / 2)

@@ -40,5 +40,5 @@ def test_one_scene_of_the_tuning_pool(tmp_path, monkeypatch):
     run_script("completion/meshes.py", "score", "--out", tmp_path / "crops", "--results", tmp_path / "results")
     rows = read_csv(tmp_path / "results/summary.csv")
     of_all = {row["completer"]: row for row in rows if row["group"] == "all"}
-    assert {"extrude", "network", "generated", "posterior", "pooled"} <= set(of_all)
+    assert {"extrude", "network", "prior", "posterior", "pooled"} <= set(of_all)
     assert all(0 < float(row["iou"]) < 1 for row in of_all.values())

@@ -244,7 +244,7 @@ def test_training_learns_resumes_and_is_used(files, tmp_path):
 
     run_script("completion/compare.py", tmp_path / "a", "--most", 6, "--out", tmp_path / "out")
     rows = {row["completer"]: row for row in read_csv(tmp_path / "out/completion.csv") if row["group"] == "all"}
-    assert len(rows) == 8 and float(rows["extrude"]["iou"]) > float(rows["surface"]["iou"])
+    assert len(rows) == 9 and float(rows["extrude"]["iou"]) > float(rows["surface"]["iou"])
 
     one = NetworkCompleter(weights=str(tmp_path / "a"))
     frame = frame_of(TWO, width=320)
@@ -265,9 +265,10 @@ def test_settings():
         CompletionTraining.recipe("fast")
 
 
-def test_steps_on_a_batch_lower_its_loss(samples):
+@pytest.mark.parametrize("prior", [False, True])
+def test_steps_on_a_batch_lower_its_loss(samples, prior):
     torch.manual_seed(0)
-    settings = replace(SMALL, half_precision=False)
+    settings = replace(SMALL, half_precision=False, prior=prior)
     networks, (batch,) = settings.networks(), settings.batches((samples, None), 0, 1)
     optimiser, losses = torch.optim.AdamW(networks["net"].parameters(), lr=1e-2), []
     for step in range(8):
@@ -294,9 +295,9 @@ def test_training_starts_from_a_model(files, tmp_path):
 
 def test_a_channel_that_the_first_model_lacks_has_weights_0():
     torch.manual_seed(0)
-    plain = replace(SMALL, prior=False).networks()["net"]
-    more = SMALL.networks()["net"]
-    more.load_state_dict(SMALL.first_weights(plain.state_dict()))
+    with_prior = replace(SMALL, prior=True)
+    plain, more = SMALL.networks()["net"], with_prior.networks()["net"]
+    more.load_state_dict(with_prior.first_weights(plain.state_dict()))
     x = torch.rand(1, 9, 32, 32, 32)
     assert torch.allclose(plain(x[:, :8]), more(x), atol=1e-5) and more.has_prior and not plain.has_prior
 

@@ -46,8 +46,8 @@ class NetworkCompleter(OnLattice, UsesFiles):
         of their surface. If less than the share `least_surface` of a large visible surface survives, all of it is
         restored (p >= .5). With 0, none is.
     prior : Posterior
-        The prior over whole shapes, whose mean is a channel of the package's network. A network without this channel
-        does not use it.
+        The prior over whole shapes, whose mean is a channel of the weights `completion_prior`. A network without this
+        channel does not use it.
     architecture : Architecture, optional
         That of the model in the folder. The default is that of the package's network.
     """

@@ -1,6 +1,6 @@
 """Several completers that answer as one: the weighted mean of their probabilities.
 
->>> Pooled()                                      # a network that does not know of whole shapes, and the posterior
+>>> Pooled()                                                               # the network and the posterior over shapes
 >>> Pooled(completers=(NetworkCompleter(), Posterior(kinds=(BoxKind(),))), weights=(0.7, 0.3))
 """
 
@@ -37,7 +37,7 @@ class Pooled(OnLattice, UsesFiles):
         factors of `Completer.opinions`: a `Posterior` does not count for an object that fits none of its kinds.
     """
 
-    completers: tuple[Completer, ...] = (NetworkCompleter(weights="completion_generated"), Posterior())
+    completers: tuple[Completer, ...] = (NetworkCompleter(), Posterior())
     weights: tuple[float, ...] = (0.4, 0.6)
 
     def __post_init__(self) -> None:
