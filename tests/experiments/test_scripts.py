@@ -31,12 +31,12 @@ STUDIES = [
 
 @pytest.mark.parametrize("name", STUDIES)
 def test_a_study_can_be_planned_and_keeps_tuning_and_reported_seeds_apart(name, monkeypatch):
-    """The small form uses tuning seeds only."""
+    """The small form uses tuning seeds only. Seeds from 100 to 199 confirm what was chosen on those below."""
     path, first = EXPERIMENTS / f"{name}.toml", REPORTED.get(name, 0)
     if 'family = "m1"' in path.read_text():
         monkeypatch.setenv("MSTFILTER_OBJECTS", str(find_shared("meshes/index.csv").parent))
     seeds = [scene.source["seed"] for scene in make_plan(load_study(path)).scenes]
-    assert set(seeds) <= set(range(first, first + 100))
+    assert set(seeds) <= set(range(first, first + (100 if first else 200)))
     assert first == 0 or first >= FIRST_REPORTED_SEED
     if "[smoke]" in path.read_text():
         assert all(scene.source["seed"] < 100 for scene in make_plan(load_study(path, smoke=True)).scenes)

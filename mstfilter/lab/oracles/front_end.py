@@ -48,7 +48,7 @@ class TrueMasks(UsesTruth, Proposal):
 
     completer: Completer = field(default_factory=Extrude)
     objects: ObjectRule = field(default_factory=ObjectRule)
-    threshold: float = 0.5
+    threshold: float = 0.45
 
     properly_weighted: ClassVar[bool] = False
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "instance")
