@@ -26,6 +26,7 @@ from mstfilter.scoring.statistics import interval
 
 CLIPPED, ASKED = 0.01, 0.02  # as in meshes.py
 THRESHOLDS = (0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6)
+TRAINING = training_program("completion")
 HELD_OUT = training_program("shapes").HELD_OUT
 CompletionSamples = training_program("completion_data").CompletionSamples
 
@@ -40,19 +41,6 @@ def complete(completer: Completer, samples: CompletionSamples) -> np.ndarray:
         for k, box, p in zip(part, boxes, completer.fill_many([rngs[k] for k in part], boxes), strict=True):
             found[k] = np.where(box.free, 0, p)
     return found
-
-
-def iou_at(p: np.ndarray, truth: np.ndarray, threshold: float) -> np.ndarray:
-    """IoU (n,) of the voxels with at least a probability."""
-    filled, axes = p >= threshold, (1, 2, 3)
-    return (filled & truth).sum(axis=axes) / np.maximum((filled | truth).sum(axis=axes), 1)
-
-
-def log_loss(p: np.ndarray, truth: np.ndarray, asked: np.ndarray) -> np.ndarray:
-    """Mean log loss (n,) in nats of the voxels in question."""
-    q = np.clip(p.astype(np.float32), CLIPPED, 1 - CLIPPED)
-    total = (-np.log(np.where(truth, q, 1 - q)) * asked).sum(axis=(1, 2, 3))
-    return total / np.maximum(asked.sum(axis=(1, 2, 3)), 1)
 
 
 def main() -> None:
@@ -94,8 +82,9 @@ def main() -> None:
     asked = ~free & (own | np.any([p > ASKED for p in found.values()], axis=0))
     rows = []
     for name, p in found.items():
-        at = {threshold: iou_at(p, samples.truth, threshold) for threshold in THRESHOLDS}
-        iou, loss = at[0.5], log_loss(p, samples.truth, asked)
+        at = {threshold: TRAINING.shape_iou(p >= threshold, samples.truth) for threshold in THRESHOLDS}
+        q = np.clip(p.astype(np.float32), CLIPPED, 1 - CLIPPED)
+        iou, loss = at[0.5], TRAINING.shape_log_loss(q, samples.truth, asked)
         best = max(THRESHOLDS, key=lambda threshold: at[threshold].mean())
         of_scene = np.array([iou[samples.scene == k].mean() for k in np.unique(samples.scene)])
         low, high = interval(of_scene)

@@ -57,8 +57,9 @@ METHODS: dict[str, tuple[str, ...]] = {
 }
 #: What is summarised: quality of the one answer, mean quality of the hypotheses, and log loss of all that is known.
 MEASURES = ("quality_answer", "quality", "log_loss", LOG_LOSS, f"{LOG_LOSS}_kept", f"{LOG_LOSS}_answer")
-#: What forecasts are of: all that a method knows, the hypotheses that it keeps, and its one answer.
-FORECASTS = {"": "all", "_kept": "kept", "_answer": "answer"}
+#: What forecasts are of, with the ending of its columns: all that a method knows, the hypotheses that it keeps, and
+#: its one answer.
+FORECASTS = {"all": "", "kept": "_kept", "answer": "_answer"}
 _WORST = 12  # pauses on a contact sheet
 
 
@@ -124,7 +125,7 @@ def run(
             forecasts = forecasts_of(belief, clip.after.camera, truth.labels)
             losses = {
                 f"log_loss{suffix}": round(forecasts[name].log_loss(SOFTENING), 4) if forecasts[name].n else ""
-                for suffix, name in FORECASTS.items()
+                for name, suffix in FORECASTS.items()
             }
             followed = _kept(histories[name])
             about = {"sequence": sequence.name, "source": sequence.source, "pause": clip.index, "method": name}
@@ -134,7 +135,7 @@ def run(
 def forecasts_of(belief: Belief, camera: Camera, labels: np.ndarray) -> dict[str, ForecastTable]:
     """`pixel_forecasts` of what `FORECASTS` names; empty ones where fewer than two objects are marked."""
     if len(np.unique(labels[labels > 0])) < 2:
-        return dict.fromkeys(FORECASTS.values(), ForecastTable.of([], []))
+        return dict.fromkeys(FORECASTS, ForecastTable.of([], []))
     named = {"all": belief, "kept": belief.kept, "answer": Belief(Population([belief.estimate()]))}
     return {name: pixel_forecasts(one, camera, labels) for name, one in named.items()}
 
@@ -143,7 +144,7 @@ def forecast_rows(sequence: str, method: str, tables: list[dict[str, ForecastTab
     """The forecasts of a method in a sequence, counted over its pauses."""
     return [
         {"sequence": sequence, "method": method, "of": name, "p": f"{p:.2f}", "no": int(no), "yes": int(yes)}
-        for name in FORECASTS.values()
+        for name in FORECASTS
         for table in [ForecastTable.pooled([one[name] for one in tables])]
         for p, no, yes in zip(table.p, table.no, table.yes, strict=True)
     ]
@@ -156,7 +157,6 @@ def recalibrated(rows: list[dict[str, str]]) -> dict[tuple[str, str], dict[str, 
         groups[row["method"], row["of"]][row["sequence"]].append(row)
     found: dict[tuple[str, str], dict[str, float]] = defaultdict(dict)
     for (method, of), by_sequence in groups.items():
-        suffix = next(key for key, name in FORECASTS.items() if name == of)
         tables = {
             name: ForecastTable(*(np.array([float(row[key]) for row in own]) for key in ("p", "no", "yes")))
             for name, own in by_sequence.items()
@@ -164,7 +164,7 @@ def recalibrated(rows: list[dict[str, str]]) -> dict[tuple[str, str], dict[str, 
         for name, table in tables.items():
             if others := [one for other, one in tables.items() if other != name]:
                 loss = Recalibration.fit(ForecastTable.pooled(others)).log_loss(table)
-                found[name, method][f"{LOG_LOSS}{suffix}"] = round(loss, 4)
+                found[name, method][f"{LOG_LOSS}{FORECASTS[of]}"] = round(loss, 4)
     return found
 
 

@@ -229,7 +229,7 @@ def measure(
     figures = {
         "iou": float(iou["network"].mean()),
         "iou_extrude": float(iou["extrude"].mean()),
-        "log_loss": float(_log_loss(p, truth, question).mean()),
+        "log_loss": float(shape_log_loss(p, truth, question).mean()),
         "calibration_error": ForecastTable.of(np.round(p[question], 3), truth[question]).reliability(20).error,
     }
     return figures, rows
@@ -253,7 +253,7 @@ def shape_iou(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.asarray((found & truth).sum(axis=axes) / np.maximum((found | truth).sum(axis=axes), 1))
 
 
-def _log_loss(p: np.ndarray, truth: np.ndarray, question: np.ndarray) -> np.ndarray:
+def shape_log_loss(p: np.ndarray, truth: np.ndarray, question: np.ndarray) -> np.ndarray:
     """Mean log loss (n,) in nats of the voxels in question."""
     p = np.clip(p, 1e-6, 1 - 1e-6)
     loss = -np.log(np.where(truth, p, 1 - p))

@@ -152,16 +152,15 @@ class Answer:
         places: dict[str, list[float]] = {}
         for border in self.borders:
             places.setdefault(border.text, []).append(border.one_object)
-        texts = []
+        texts, meaning = [], " that both sides are one object"  # said once
         for text, one in places.items():
-            if len(one) == 1 or not text.startswith("between"):
-                texts += [f"{text} ({share(p)})" for p in one]
-            else:
+            if len(one) > 1 and text.startswith("between"):
                 there = " or ".join(share(1 - p) for p in sorted(one))
                 texts.append(f"{text}, which meet at one of {len(one)} places ({there})")
-        first = next((k for k, text in enumerate(texts) if "which meet" not in text), None)
-        if first is not None:
-            texts[first] = texts[first].replace(")", " that both sides are one object)")
+                continue
+            for p in one:
+                texts.append(f"{text} ({share(p)}{meaning})")
+                meaning = ""
         return texts
 
 

@@ -154,20 +154,20 @@ class TrainedNetwork:
         """
         bits = np.zeros((BATCH, edge, edge, edge), np.uint8)
         signed = np.zeros(bits.shape, np.int8)
-        prior = np.zeros(bits.shape, np.float32)
+        prior = None if priors is None else np.zeros(bits.shape, np.float32)
         height = np.zeros(edge)
         for k, one in enumerate(seen):
             a, b, c = one.surface.shape
             bits[k, :a, :b, :c], signed[k, :a, :b, :c] = encode_box(one)
             height = one.height[0] + one.voxel_size * np.arange(edge)
-            if priors is not None:
+            if prior is not None and priors is not None:
                 prior[k, :a, :b, :c] = priors[k]
         with torch.inference_mode(), one_thread():
             x = channels(
                 torch.from_numpy(bits),
                 torch.from_numpy(signed),
                 torch.from_numpy(height).float(),
-                torch.from_numpy(prior) if self.has_prior else None,
+                None if prior is None else torch.from_numpy(prior),
             )
             p = torch.sigmoid(self.scale * self.forward(x) + self.shift)
         return np.asarray(p.numpy()[: len(seen)])
