@@ -3,22 +3,24 @@
 >>> answer = Answer.of(belief, table, camera)
 >>> answer.sentences
 ['4 objects in view.', '1 is hidden and remembered: 4 (.80).',
- '1 border is open: between objects 2 and 3 (.47 that both sides are one object).']
->>> answer.outlines, answer.borders             # in pixels, for SVG or matplotlib
+ '1 border is open: between objects 2 and 3 (.47 that both sides are one object). A push against 3, as the
+ arrow shows, would tell most.']
+>>> answer.outlines, answer.borders, answer.push       # in pixels, for SVG or matplotlib
 >>> plot_answer(answer, image)                  # the picture; `Belief.plot(image, camera)` draws it too
 >>> changes(before, now)                        # what a push did, from the tables of two pauses
 ['Moved: 2 (by 4 cm).', '2 and 3 are one object with probability .02 (.47 before).']
 
-The report, the console and notebooks show the same picture and the same words. No ground truth is needed.
+The report, the console and notebooks show the same picture and the same words. No ground truth is needed. A border
+between two objects that surely are two is none that is open: only where they meet is uncertain, by a few pixels.
 """
 
 from __future__ import annotations
 
 from base64 import b64encode
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib.style
 import numpy as np
@@ -29,7 +31,7 @@ from matplotlib.patches import Polygon
 from mstfilter.app.report.charts import Drawing
 from mstfilter.app.report.export import mesh_bytes
 from mstfilter.app.report.pictures import border_colour, close_up, colour, hexadecimal
-from mstfilter.mst.belief import Belief, BelievedObject, Border, ObjectTable
+from mstfilter.mst.belief import Belief, BelievedObject, Border, ObjectTable, push_candidates
 from mstfilter.runs import RunFolder
 from mstfilter.scene import Camera, project, render
 
@@ -39,6 +41,7 @@ _MOVED = 0.01  # metres
 _NEAR = 0.2  # metres within which a new object is looked for beside one that was perhaps several
 _CHANGED = 0.1  # of a probability
 _MOST = 5  # cases of a sentence that are listed
+_ARROW = 0.06  # metres, length of the arrow of a push before its contact
 
 Point = tuple[float, float]
 
@@ -89,6 +92,14 @@ class OpenBorder:
         return f"inside object {self.numbers[0]}" if self.numbers else "beside the objects"
 
 
+class Arrow(NamedTuple):
+    """A push in the image."""
+
+    start: Point  #: (column, row)
+    end: Point  #: the contact
+    number: int  #: of the object that is pushed
+
+
 @dataclass(frozen=True, eq=False)
 class Answer:
     """The objects of a table in an image, and the borders that are open."""
@@ -97,6 +108,9 @@ class Answer:
     box: tuple[float, float, float, float]  #: part of the image to be shown: x, y, width, height in pixels
     outlines: Sequence[Outline] = field(default_factory=tuple)
     borders: Sequence[OpenBorder] = field(default_factory=tuple)  #: the most uncertain first
+    #: Pairs of objects that are two, and of which it is uncertain where they meet.
+    meeting: Sequence[tuple[int, int]] = field(default_factory=tuple)
+    push: Arrow | None = None  #: the push that would tell most, for a tool that can reach the whole grid
 
     @classmethod
     def of(cls, belief: Belief, table: ObjectTable, camera: Camera) -> Answer:
@@ -106,9 +120,12 @@ class Answer:
         image = _label_image(belief, camera)
         tags = _Tags(camera.width, camera.height, _APART * shown * camera.width)
         number_of = {one.label: one.number for one in table if one.in_estimate}
-        open_borders = []
+        open_borders, meeting = [], []
         for border in belief.open_borders(camera):
             numbers = _numbers(border, image, number_of)
+            if len(numbers) == 2 and table.by_number(numbers[0]).one_with.get(numbers[1], 0.0) <= _SURE:
+                meeting.append((numbers[0], numbers[1]))
+                continue
             thick = np.zeros(image.shape, np.uint8)
             thick[border.pixels[:, 1], border.pixels[:, 0]] = 1
             x, y = border.middle.tolist()
@@ -124,22 +141,35 @@ class Answer:
             around = _polygons(masks[k].astype(np.uint8), outer=True)
             found[k] = Outline(one.number, not one.visible, around, named)
         outlines = tuple(found[k] for k in range(len(table)))
-        return cls(table, box, outlines, tuple(open_borders))
+        push = _push(belief, camera, number_of) if open_borders else None
+        return cls(table, box, outlines, tuple(open_borders), tuple(dict.fromkeys(meeting)), push)
 
     @cached_property
     def sentences(self) -> list[str]:
         """How many objects there are, what is hidden, and what is open."""
-        hidden = [one for one in self.table if not one.visible]
-        found = [f"{_count(len(self.table) - len(hidden), 'object')} in view."]
+        seen = {(one.record.id, one.record.birth): one.number for one in self.table if one.visible}
+        unseen = [(one, seen.get((one.record.id, one.record.birth))) for one in self.table if not one.visible]
+        hidden = [one for one, visible in unseen if visible is None]
+        found = [f"{_count(len(self.table) - len(unseen), 'object')} in view."]
         if hidden:
             names = _listed([f"{one.number} ({share(one.existence)})" for one in hidden])
             found.append(f"{len(hidden)} {'is' if len(hidden) == 1 else 'are'} hidden and remembered: {names}.")
+        found += [
+            f"Perhaps {visible} is hidden elsewhere, as {one.number} ({share(one.existence)})."
+            for one, visible in unseen
+            if visible is not None
+        ]
         if self.borders:
             texts = self._open_borders()
             n = len(texts)
             found.append(f"{n} border{' is' if n == 1 else 's are'} open: {_listed(texts)}.")
+            if self.push is not None:
+                found.append(f"A push against {self.push.number}, as the arrow shows, would tell most.")
         else:
             found.append("No border is open.")
+        if self.meeting:
+            pairs = _listed([f"{a} and {b}" for a, b in self.meeting])
+            found.append(f"Uncertain by a few pixels is where these meet, which are two: {pairs}.")
         asked = {number for border in self.borders for number in border.numbers}
         parts = [one for one in self.table if one.several > _CHANGED and one.number not in asked]
         if parts:
@@ -148,19 +178,16 @@ class Answer:
         return found
 
     def _open_borders(self) -> list[str]:
-        """The open borders in words. Several between the same two objects are places where these may meet."""
-        places: dict[str, list[float]] = {}
+        """The open borders in words; those between the same objects are named together."""
+        places: dict[str, list[str]] = {}
         for border in self.borders:
-            places.setdefault(border.text, []).append(border.one_object)
+            places.setdefault(border.text, []).append(share(border.one_object))
         texts, meaning = [], " that both sides are one object"  # said once
-        for text, one in places.items():
-            if len(one) > 1 and text.startswith("between"):
-                there = " or ".join(share(1 - p) for p in sorted(one))
-                texts.append(f"{text}, which meet at one of {len(one)} places ({there})")
-                continue
-            for p in one:
-                texts.append(f"{text} ({share(p)}{meaning})")
-                meaning = ""
+        for text, probabilities in places.items():
+            n = len(probabilities)
+            where = f", at {n} places" if n > 1 else ""
+            texts.append(f"{text}{where} ({' and '.join(probabilities)}{meaning})")
+            meaning = ""
         return texts
 
 
@@ -168,7 +195,7 @@ class Answer:
 def plot_answer(answer: Answer, image: np.ndarray) -> Drawing:
     """The picture of an answer over the image (H, W, 3): outlines with numbers, and open borders with probabilities.
 
-    Hidden objects are dashed. The colour of a border goes from yellow (two objects) to pink (one).
+    Hidden objects are dashed. The colour of a border goes from yellow (two objects) to pink (one). The arrow is `push`.
     """
     _, _, width, height = answer.box
     figure = Drawing(figsize=(6.4, 6.4 * height / width), layout="constrained")
@@ -192,6 +219,9 @@ def draw_answer(axes: Axes, answer: Answer, image: np.ndarray) -> None:
     for border in answer.borders:
         for points in border.polygons:
             axes.add_patch(Polygon(points, facecolor=hexadecimal(border_colour(border.one_object)), edgecolor="none"))
+    if answer.push is not None:
+        arrow: Any = {"arrowstyle": "-|>,head_width=0.4,head_length=0.7", "color": "#f6f6f2", "lw": 3}
+        axes.annotate("", answer.push.end, answer.push.start, arrowprops=arrow)
     tags = [(one.tag, "white", 11) for one in answer.outlines if one.tag is not None]
     tags += [(one.tag, hexadecimal(border_colour(one.one_object)), 13) for one in answer.borders]
     for tag, ink, size in tags:
@@ -221,7 +251,7 @@ def changes(before: ObjectTable, now: ObjectTable) -> list[str]:
     both = [(old[k], new[k]) for k in sorted(old.keys() & new.keys())]
     parts = _parts(old, new)
     found = []
-    shifts = [(b.number, _shift(a, b)) for a, b in both if b.number not in parts]
+    shifts = [(b.number, _shift(a, b)) for a, b in both if b.number not in parts or _descends(a, b)]
     moved = [f"{k} (by {100 * shift:.0f} cm)" for k, shift in shifts if shift > _MOVED]
     if moved:
         found.append(f"Moved: {_listed(moved)}.")
@@ -234,7 +264,10 @@ def changes(before: ObjectTable, now: ObjectTable) -> list[str]:
                     found.append(f"{pair} are one object with probability {share(q)} ({share(p)} before).")
     for a, b in both:
         if a.number in parts:
-            found.append(f"{a.number} is two objects, {a.number} and {parts[a.number]} ({share(a.several)} before).")
+            two = 1 - b.one_with.get(parts[a.number], 0.0)
+            said = "is" if two >= 1 - _SURE else f"is with probability {share(two)}"
+            pair = f"{a.number} and {parts[a.number]}"
+            found.append(f"{a.number} {said} two objects, {pair} ({share(a.several)} before).")
         elif abs(a.several - b.several) > _CHANGED:
             found.append(
                 f"{a.number} is several objects with probability {share(b.several)} ({share(a.several)} before)."
@@ -252,11 +285,16 @@ def changes(before: ObjectTable, now: ObjectTable) -> list[str]:
 
 
 def _shift(before: BelievedObject, now: BelievedObject) -> float:
-    """How far an object has moved, metres. A middle that only its new shape has moved does not count."""
-    same = before.record.id == now.record.id
-    if same and np.allclose(before.pose.as_matrix(), now.pose.as_matrix()):
-        return 0.0
+    """How far the middle of an object has moved, metres. What only its new shape has moved does not count."""
+    if _descends(before, now):
+        motion = now.pose * before.pose.inv()
+        return float(np.linalg.norm(motion.apply(before.centre) - before.centre))
     return float(np.linalg.norm(now.centre - before.centre))
+
+
+def _descends(before: BelievedObject, now: BelievedObject) -> bool:
+    """Whether both are one object of hypotheses that descend from one another."""
+    return (before.record.id, before.record.birth) == (now.record.id, now.record.birth)
 
 
 #: The columns of the table of objects: keys of `table_cells`, and their heads.
@@ -291,7 +329,7 @@ def _object_row(one: BelievedObject) -> dict[str, str]:
     """The texts of a row of the table of objects."""
     maybe = [f"one with {k} ({share(p)})" for k, p in one.one_with.items() if p > _SURE]
     maybe += [f"several ({share(one.several)})"] if one.several > _SURE else []
-    moved = float(np.linalg.norm(one.pose.translation)), float(np.degrees(one.pose.rotation.magnitude()))
+    moved = float(np.linalg.norm(one.shift)), float(np.degrees(one.pose.rotation.magnitude()))
     volume, low, high = (f"{1e6 * v:.0f}" for v in (one.volume, *one.volume_range))
     return {
         "number": str(one.number),
@@ -335,6 +373,19 @@ def _parts(old: dict[int, BelievedObject], new: dict[int, BelievedObject]) -> di
         if near and min(near)[0] < _NEAR:
             found[min(near)[1]] = k
     return found
+
+
+def _push(belief: Belief, camera: Camera, number_of: Mapping[int, int]) -> Arrow | None:
+    """The most informative push of a tool that reaches the whole grid."""
+    grid = belief.grid
+    if camera.T_world_camera is None or not belief.estimate().n_objects:
+        return None
+    for best in push_candidates(belief, camera, (grid.origin, grid.upper)):
+        number = number_of.get(best.label)
+        if number is not None:
+            (x, y), (u, v) = camera.project(np.array([best.contact - _ARROW * best.direction, best.contact]))[0].tolist()
+            return Arrow((x, y), (u, v), number)
+    return None
 
 
 def _numbers(border: Border, image: np.ndarray, number_of: dict[int, int]) -> tuple[int, ...]:

@@ -88,6 +88,7 @@ def _answer(answer: Answer, mesh: bool) -> dict[str, Any]:
         "sentences": answer.sentences,
         "outlines": [(one, hexadecimal(colour(one.number - 1))) for one in answer.outlines],
         "borders": [(one, hexadecimal(border_colour(one.one_object))) for one in answer.borders],
+        "push": answer.push,
         "rows": table_cells(answer.table),
         "mesh": mesh_link(answer.table) if mesh else "",
     }

@@ -89,6 +89,11 @@ class BelievedObject:
         """Rigid motion in world metres since the object was first proposed (`Hypothesis.pose`)."""
         return self.record.pose
 
+    @property
+    def shift(self) -> np.ndarray:
+        """(3,) metres, how far its middle has moved since the object was first proposed."""
+        return np.asarray(self.centre - self.pose.inv().apply(self.centre))
+
     def __repr__(self) -> str:
         return f"BelievedObject {self.text}"
 

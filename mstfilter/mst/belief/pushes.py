@@ -43,6 +43,14 @@ class PushCandidate:
     information: float  #: nats, expected from seeing what moves
     border: Border  #: the border that the push asks about
     clearance: float  #: metres of free way before the contact
+    label: int  #: of the object of `Belief.estimate` that is touched
+
+    def __repr__(self) -> str:
+        (x, y, z), (a, b, _) = self.contact, self.direction
+        return (
+            f"PushCandidate(contact=({x:.3f}, {y:.3f}, {z:.3f}) m, direction=({a:.2f}, {b:.2f}, 0), "
+            f"length={self.length:g} m, information={self.information:.2f} nats)"
+        )
 
     @property
     def start(self) -> np.ndarray:
@@ -207,7 +215,9 @@ class _Scene:
         contact = (
             direction * (first.min() - half) + across * place + np.array([0.0, 0.0, height])
         )  # direction, across and z are at right angles
-        push = PushCandidate(contact, direction, self.length, information, border, self.clearance)
+        touched = self.belief.grid.index_of(strip[first.argmin()][None])[0]
+        label = int(self.belief.estimate().labels[tuple(touched)])
+        push = PushCandidate(contact, direction, self.length, information, border, self.clearance, label)
         return push if self._is_possible(push) else None
 
     def _is_possible(self, push: PushCandidate) -> bool:

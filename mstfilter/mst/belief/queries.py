@@ -81,6 +81,10 @@ class Border(NamedTuple):
     #: (2, H, W) bool, the two objects on its sides in the most probable segmentation in which they are two
     sides: np.ndarray
 
+    def __repr__(self) -> str:
+        column, row = self.middle.tolist()
+        return f"Border(one_object={self.one_object:.2f}, middle=({column}, {row}), {len(self.pixels)} pixels)"
+
     @property
     def middle(self) -> np.ndarray:
         """The pixel (2,) of the border that is nearest to the mean of its pixels."""

@@ -42,7 +42,7 @@ OBJECT_COLUMNS = tuple(column for name in _FIELDS for column in _LISTS.get(name,
 def object_row(one: BelievedObject, T_frame_world: RigidTransform | None = None) -> dict[str, Any]:
     """The figures of an object by name; see `BelievedObject.row`."""
     T = RigidTransform.identity() if T_frame_world is None else T_frame_world
-    box, moved = T * one.T_world_box, T * one.pose * T.inv()
+    box, turned = T * one.T_world_box, T.rotation * one.pose.rotation * T.rotation.inv()
     # The variance along an axis of the new frame, if the errors along the axes of the grid are independent.
     spread = np.sqrt(T.rotation.as_matrix() ** 2 @ one.spread**2)
     lists = {
@@ -51,8 +51,8 @@ def object_row(one: BelievedObject, T_frame_world: RigidTransform | None = None)
         "box_centre": box.translation,
         "box_quaternion_xyzw": box.rotation.as_quat(),
         "sides": one.sides,
-        "moved": moved.translation,
-        "turned_quaternion_xyzw": moved.rotation.as_quat(),
+        "moved": T.rotation.apply(one.shift),
+        "turned_quaternion_xyzw": turned.as_quat(),
     }
     row = {
         "object": one.number,

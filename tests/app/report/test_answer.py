@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from mstfilter.app.report.answer import Answer, changes, share
+from mstfilter.mst.belief import push_candidates
 from mstfilter.scene import WeightedSegmentations, project
-from tests.mst.belief.test_objects import CAMERA, FAR, HIDDEN, LEFT, RIGHT, at, belief_of, scene, two_readings
+from tests.mst.belief.test_objects import CAMERA, FAR, GRID, HIDDEN, LEFT, RIGHT, at, belief_of, scene, two_readings
 
 
 def polygons(path):
@@ -34,7 +35,14 @@ def test_sentences_and_borders_of_two_readings():
         "3 objects in view.",
         f"1 is hidden and remembered: {hidden} (.60).",
         f"1 border is open: between objects {left} and {right} (.25 that both sides are one object).",
+        f"A push against {answer.push.number}, as the arrow shows, would tell most.",
     ]
+    best = push_candidates(belief, CAMERA, (GRID.origin, GRID.upper))[0]
+    assert answer.push.number in (left, right)
+    np.testing.assert_allclose(answer.push.end, CAMERA.project(best.contact[None])[0][0], atol=1e-6)
+    along = np.subtract(answer.push.end, answer.push.start)
+    step = CAMERA.project((best.contact + 0.01 * best.direction)[None])[0][0] - answer.push.end
+    assert along @ step > 0.9 * np.linalg.norm(along) * np.linalg.norm(step)
     [border] = answer.borders
     assert border.numbers == (left, right) and border.tag.text == ".25"
     # The border is drawn where the boxes touch: the plane x = -0.04 m.
@@ -43,18 +51,41 @@ def test_sentences_and_borders_of_two_readings():
     assert x.min() - 4 < drawn[:, 0].min() and drawn[:, 0].max() < x.max() + 4
 
 
-def test_two_borders_of_one_pair_are_two_places():
-    """Two objects touch, and it is open where one ends: .81 at one place, .19 at another."""
+def test_two_objects_whose_common_border_is_uncertain_have_no_open_border():
+    """Both hypotheses have two objects; in one, the first ends 1 cm farther to the right."""
+    other = (np.s_[8:17, 15:22, :9], np.s_[17:24, 15:22, :9])
+    belief = belief_of((0.6, scene(LEFT, RIGHT, FAR)), (0.4, scene(*other, FAR)))
+    assert belief.open_borders(CAMERA)
+    answer = answer_of(belief)
+    assert not answer.borders and answer.push is None
+    assert answer.sentences == [
+        "3 objects in view.",
+        "No border is open.",
+        "Uncertain by a few pixels is where these meet, which are two: 1 and 2.",
+    ]
+
+
+def test_an_object_that_is_perhaps_somewhere_else():
+    """A hidden object with the record of a visible one is another place of it, and nothing that is remembered."""
+    moved, kept = scene(LEFT, FAR), scene(LEFT, HIDDEN, hidden=(2,))
+    kept = replace(kept, objects=(kept.objects[0], replace(kept.objects[1], id=moved.objects[1].id)))
+    table = belief_of((0.7, moved), (0.3, kept)).objects()
+    far, hidden = (at(table, box).number for box in (FAR, HIDDEN))
+    text = f"Perhaps {far} is hidden elsewhere, as {hidden} (.30)."
+    assert answer_of(belief_of((0.7, moved), (0.3, kept))).sentences[:2] == ["2 objects in view.", text]
+
+
+def test_two_borders_of_one_pair_are_named_together():
     answer = answer_of(two_readings(p_one=0.25))
     [border] = answer.borders
     a, b = border.numbers
     twice = replace(answer, borders=(replace(border, one_object=0.19), replace(border, one_object=0.81)))
-    text = f"between objects {a} and {b}, which meet at one of 2 places (.81 or .19)"
-    assert twice.sentences[-1] == f"1 border is open: {text}."
+    text = f"between objects {a} and {b}, at 2 places (.19 and .81 that both sides are one object)"
+    assert twice.sentences[-2] == f"1 border is open: {text}."
     inside = replace(border, one_object=0.5, numbers=(a,))
     both = replace(twice, borders=(*twice.borders, inside))
-    that = f"inside object {a} (.50 that both sides are one object)"
-    assert both.sentences[-1] == f"2 borders are open: {text}, {that}."
+    that = f"inside object {a} (.50)"
+    assert both.sentences[-2] == f"2 borders are open: {text}, {that}."
 
 
 def test_outlines_are_those_of_the_objects():

@@ -96,7 +96,7 @@ def test_a_candidate_pushes_at_its_height_and_parts_are_shown():
     above = np.array([0.1, 0.0, 0.15])
     push = FingerPush.with_tip(above, above + (0.05, 0, 0), 1.0)
     assert push.target(0.5)[2] == pytest.approx(0.25) and FingerPush.with_tip(0 * above, above, 1.0).height < 0.13
-    candidate = PushCandidate(above, np.array([1.0, 0, 0]), 0.05, 0.1, None, 0.02)
+    candidate = PushCandidate(above, np.array([1.0, 0, 0]), 0.05, 0.1, None, 0.02, 1)
     loop.play(candidate)
     assert loop.n_pushes == 1
 

@@ -32,11 +32,15 @@ def test_rows_in_the_frame_of_a_base():
     corners = 0.5 * np.array(row["sides"]) * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     want = T_BASE_WORLD.apply(one.T_world_box.apply(corners))
     np.testing.assert_allclose(box.apply(corners), want, atol=1e-4)
-    # A point of the object that moves in the world moves to the same place in the base.
-    moved = RigidTransform.from_components(row["moved"], Rotation.from_quat(row["turned_quaternion_xyzw"]))
-    before = np.array([0.05, -0.1, 0.02])
+    # The middle has come from where the inverse motion takes it, whatever the frame, and the object turns about it.
+    came_from = T_BASE_WORLD.apply(pose.inv().apply(middle))
+    np.testing.assert_allclose(row["moved"], np.array(row["centre"]) - came_from, atol=2e-5)
+    assert np.linalg.norm(row["moved"]) == pytest.approx(np.linalg.norm(here["moved"]), abs=2e-5)
+    turned, before = Rotation.from_quat(row["turned_quaternion_xyzw"]), np.array([0.05, -0.1, 0.02])
     np.testing.assert_allclose(
-        moved.apply(T_BASE_WORLD.apply(before)), T_BASE_WORLD.apply(pose.apply(before)), atol=1e-4
+        turned.apply(T_BASE_WORLD.apply(before) - came_from) + row["centre"],
+        T_BASE_WORLD.apply(pose.apply(before)),
+        atol=1e-4,
     )
     same = ("object", "existence", "volume", "volume_range", "sides", "colour", "one_with")
     assert all(row[name] == here[name] for name in same) and list(row) == list(here)
