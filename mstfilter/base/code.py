@@ -48,6 +48,33 @@ def _is_version(node: ast.stmt) -> bool:
     return isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__version__"
 
 
+def hash_of_script(path: Path, source: bytes) -> str:
+    """A hash of a Python file and of the files beside it that it imports, without comments and docstrings."""
+    found, todo = {path: source}, [source]
+    while todo:
+        for name in _imported(todo.pop()):
+            beside = path.parent / name.replace(".", "/")
+            for file in (beside.with_suffix(".py"), beside / "__init__.py"):
+                if file not in found and file.is_file():
+                    found[file] = file.read_bytes()
+                    todo.append(found[file])
+    digest = hashlib.sha256()
+    for content in (source, *(found[file] for file in sorted(found) if file != path)):
+        digest.update(code_of(content))
+    return digest.hexdigest()
+
+
+def _imported(source: bytes) -> Iterator[str]:
+    """The names of the modules that Python code imports, and of their packages."""
+    for node in ast.walk(ast.parse(source)):
+        names = [alias.name for alias in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names = [node.module, *(f"{node.module}.{name}" for name in names)]
+        for name in names:
+            parts = name.split(".")
+            yield from (".".join(parts[: k + 1]) for k in range(len(parts)))
+
+
 def hash_of_files(root: Path, names: Iterable[str]) -> str:
     """A hash of files of a folder: their names and contents, of Python files without comments and docstrings."""
     digest = hashlib.sha256()

@@ -16,7 +16,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from mstfilter.base.code import code_of
+from mstfilter.base.code import hash_of_script
 from mstfilter.base.errors import InputError, install_hint, place_in_user_file, suggestion
 
 
@@ -74,13 +74,16 @@ def _executed(path: str | Path, source: bytes, resolved: Path, digest: str) -> M
         hints = [place] if place else []
         if isinstance(error, ModuleNotFoundError):
             missing = str(error.name).partition(".")[0]
-            hints.append(f"if {missing} is a library: {install_hint(missing)}")
-            hints.append("a file beside it is found if its folder is in the environment variable PYTHONPATH")
+            if (resolved.parent / f"{missing}.py").is_file() or (resolved.parent / missing).is_dir():
+                hints.append(f"{missing} lies beside it: set the environment variable PYTHONPATH={resolved.parent}")
+            else:
+                hints.append(f"if {missing} is a library: {install_hint(missing)}")
         raise InputError(f"{path} cannot be loaded: {type(error).__name__}: {error}", *hints) from error
+    code = hash_of_script(resolved, source)
     for cls in _classes_of(module):
         cls.__mst_file__ = f"{resolved}:{cls.__qualname__}"  # type: ignore[attr-defined]
         cls.__mst_source__ = digest  # type: ignore[attr-defined]
-        cls.__mst_code__ = hashlib.sha256(code_of(source)).hexdigest()  # type: ignore[attr-defined]
+        cls.__mst_code__ = code  # type: ignore[attr-defined]
         if (cls.__reduce_ex__, cls.__reduce__) == (object.__reduce_ex__, object.__reduce__):
             cls.__reduce_ex__ = _reduce  # type: ignore[method-assign, assignment]
     return module

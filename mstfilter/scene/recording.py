@@ -257,6 +257,8 @@ class UsesFiles(ABC):
 
     #: Fields with paths of files or folders, whose hashes a run records.
     path_fields: ClassVar[tuple[str, ...]] = ("folder", "weights", "checkpoint")
+    #: Whether the files belong to one recording, such as masks of its images. Studies refuse them for several.
+    of_one_recording: ClassVar[bool] = False
 
     @abstractmethod
     def check_files(self, recording: Recording) -> None:

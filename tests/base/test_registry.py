@@ -16,6 +16,7 @@ import pytest
 
 from mstfilter.base.errors import InputError, InputWarning
 from mstfilter.base.resources import preset_names
+from mstfilter.base.user_files import load_class
 from mstfilter.lab.oracles import TrueQuality
 from mstfilter.mst.completion import Completer
 from mstfilter.mst.crossover import CrossoverUpdate
@@ -118,7 +119,11 @@ def test_what_is_wrong_with_a_file_of_the_user(tmp_path):
     (tmp_path / "mine.py").write_text("from helper_beside import X")
     with pytest.raises(InputError, match="No module named 'helper_beside'") as caught:
         preset("mst", f"resampler={tmp_path / 'mine.py'}:Mine")
-    assert "PYTHONPATH" in caught.value.hints[-1]
+    assert "pip install helper_beside" in caught.value.hints[-1]
+    (tmp_path / "helper_beside.py").write_text("X = 1")
+    with pytest.raises(InputError, match="No module named 'helper_beside'") as caught:
+        preset("mst", f"resampler={tmp_path / 'mine.py'}:Mine")
+    assert caught.value.hints[-1].endswith(f"PYTHONPATH={tmp_path}")
     assert "pip install helper_beside" in caught.value.hints[-2]
 
 
@@ -185,6 +190,25 @@ def test_an_edited_file_is_loaded_again(tmp_path):
     assert pickle.loads(pickle.dumps(before)) == before
     mine(tmp_path / "a", "a")
     assert load(path) == before
+
+
+def test_the_code_of_a_class_includes_the_files_beside_it_that_it_imports(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(tmp_path))
+    path, helper, below = (tmp_path / name for name in ("mine.py", "helper_beside.py", "deeper_beside.py"))
+    below.write_text("THREE = 3\n")
+    helper.write_text("from deeper_beside import THREE\nTWO = THREE - 1\n")
+    path.write_text("import helper_beside\nimport os.path\n\n\nclass Mine:\n    two = helper_beside.TWO\n")
+
+    def code():
+        path.write_text(path.read_text() + "#\n")  # another content, so that it is loaded again
+        return load_class(str(path), "Mine").__mst_code__
+
+    first = code()
+    (tmp_path / "other_beside.py").write_text("1\n")  # not imported
+    below.write_text("THREE = 3  # a comment\n")
+    assert code() == first
+    below.write_text("THREE = 4\n")
+    assert code() != first
 
 
 def test_instances_of_a_file_are_pickled_and_copied(tmp_path):

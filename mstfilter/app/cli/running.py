@@ -185,7 +185,7 @@ def objects(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, with the open borders.")] = False,
     out: Annotated[Path | None, typer.Option(help="File to write instead: .csv or .json.")] = None,
 ) -> None:
-    """Print the objects of a run: where, how certain, visible or hidden, with what they may be one."""
+    """Print the objects of a run: where, how certain, visible or hidden, which other object they may belong to."""
     from mstfilter.runs import TABLE_COLUMNS, RunFolder, chosen_pauses, object_rows, pause_documents
 
     if out is not None:

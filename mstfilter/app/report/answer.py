@@ -12,13 +12,14 @@
 
 The report, the console and notebooks show the same picture and the same words. No ground truth is needed. A border
 between two objects that surely are two is none that is open: only where they meet is uncertain, by a few pixels.
+Objects that exist with a probability below .05 are left out.
 """
 
 from __future__ import annotations
 
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -115,6 +116,7 @@ class Answer:
     @classmethod
     def of(cls, belief: Belief, table: ObjectTable, camera: Camera) -> Answer:
         """The answer of a belief and its table of objects in the image of a camera."""
+        table = replace(table, objects=tuple(one for one in table if one.existence >= _SURE))
         box = close_up([belief.estimate()], camera)
         shown = box[2] / camera.width
         image = _label_image(belief, camera)
@@ -186,7 +188,8 @@ class Answer:
         for text, probabilities in places.items():
             n = len(probabilities)
             where = f", at {n} places" if n > 1 else ""
-            texts.append(f"{text}{where} ({' and '.join(probabilities)}{meaning})")
+            numbers = " and ".join(probabilities) if n < 3 else f"{min(probabilities)} to {max(probabilities)}"
+            texts.append(f"{text}{where} ({numbers}{meaning})")
             meaning = ""
         return texts
 
@@ -195,7 +198,8 @@ class Answer:
 def plot_answer(answer: Answer, image: np.ndarray) -> Drawing:
     """The picture of an answer over the image (H, W, 3): outlines with numbers, and open borders with probabilities.
 
-    Hidden objects are dashed. The colour of a border goes from yellow (two objects) to pink (one). The arrow is `push`.
+    Hidden objects are dashed. The colour of a border goes from yellow (two objects) to pink (one). An arrow shows
+    `push`.
     """
     _, _, width, height = answer.box
     figure = Drawing(figsize=(6.4, 6.4 * height / width), layout="constrained")
@@ -383,7 +387,9 @@ def _push(belief: Belief, camera: Camera, number_of: Mapping[int, int]) -> Arrow
     for best in push_candidates(belief, camera, (grid.origin, grid.upper)):
         number = number_of.get(best.label)
         if number is not None:
-            (x, y), (u, v) = camera.project(np.array([best.contact - _ARROW * best.direction, best.contact]))[0].tolist()
+            (x, y), (u, v) = camera.project(np.array([best.contact - _ARROW * best.direction, best.contact]))[
+                0
+            ].tolist()
             return Arrow((x, y), (u, v), number)
     return None
 

@@ -1,4 +1,4 @@
-"""The objects of a scene as one table: what is there, where, how certain, and with what it may be one.
+"""The objects of a scene as one table: what is there, where, how certain, and which other object it may belong to.
 
 >>> table = Belief.of_step(state, info).objects()
 >>> print(table)                                       # a line for each object

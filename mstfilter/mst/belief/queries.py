@@ -426,7 +426,7 @@ class Belief:
         return self.hypotheses.index(hypotheses[int(np.argmax(quality))])
 
     def objects(self, camera: Camera | None = None, previous: ObjectTable | None = None) -> ObjectTable:
-        """One table of the objects: existence, place, shape, visible or hidden, and with what they may be one.
+        """One table of the objects: existence, place, shape, visible or hidden, and which may belong together.
 
         See `mstfilter.mst.belief.objects`. `camera` is that of the last image, whose pixels are asked about visible
         objects; by default, that of the weighted segmentations, and if there are none, only voxels are asked. With

@@ -6,7 +6,7 @@
 ==================  ===================================================================
 `mask_files`        folders of instance masks with alternatives: layout, reader, writer
 `mask_trees`        nested masks as a tree whose cuts are segmentations
-`mask_proposal`     the proposal, and the recipe for SAM
+`mask_proposal`     the proposal, the base class of segmenters, and the recipe for SAM
 `completions`       meshes, point clouds and voxels of other programs as completions
 ==================  ===================================================================
 

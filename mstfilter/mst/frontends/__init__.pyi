@@ -6,6 +6,7 @@ from mstfilter.mst.frontends.mask_files import (
 )
 from mstfilter.mst.frontends.mask_proposal import (
     MaskProposal as MaskProposal,
+    Segmenter as Segmenter,
     write_automatic_masks as write_automatic_masks,
 )
 from mstfilter.mst.frontends.mask_trees import (

@@ -78,6 +78,7 @@ class ExternalCompletion(ClipCompleter, SurfaceOnly, UsesFiles):
     other: Completer | None = None
 
     stochastic: ClassVar[bool] = True
+    of_one_recording: ClassVar[bool] = True
 
     def check_files(self, recording: Recording) -> None:
         """Read the masks of all pauses, and place all shapes."""

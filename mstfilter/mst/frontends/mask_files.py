@@ -133,6 +133,28 @@ def read_weights(folder: Path, files: list[Path]) -> list[float] | None:
     return [float(weights[p.name]) for p in files]
 
 
+def masks_of(
+    alternatives: Sequence[np.ndarray | tuple[np.ndarray, Sequence[float] | np.ndarray]], shape: tuple[int, int]
+) -> PauseMasks:
+    """The alternatives of an image of `shape` (H, W), as `write_masks` takes them. InputError if one is invalid."""
+    if not len(alternatives):
+        raise InputError("there are no masks", "for an image without objects, give a label image of zeros")
+    content = {Path(f"alternative {k}.npz"): _packed(one) for k, one in enumerate(alternatives)}
+    return _parsed(content, None, shape, content_key("masks", shape, *content.values()))
+
+
+def _packed(one: np.ndarray | tuple[np.ndarray, Sequence[float] | np.ndarray]) -> bytes:
+    """An alternative as an npz file."""
+    masks, scores = one if isinstance(one, tuple) else (one, None)
+    masks = np.asarray(masks)
+    arrays: dict[str, np.ndarray] = {"labels" if masks.ndim == 2 else "masks": masks}
+    if scores is not None:
+        arrays["scores"] = np.asarray(scores, dtype=np.float64)
+    file = io.BytesIO()
+    np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+    return file.getvalue()
+
+
 def _parsed(
     content: Mapping[Path, bytes], weights: Sequence[float] | None, shape: tuple[int, int], key: bytes = b""
 ) -> PauseMasks:
@@ -238,14 +260,10 @@ def write_masks(
         )
     with locked(path), atomic_folder(path, "replace") as partial:
         for k, one in enumerate(alternatives):
-            masks, scores = one if isinstance(one, tuple) else (one, None)
-            masks = np.asarray(masks)
-            arrays: dict[str, np.ndarray] = {"labels" if masks.ndim == 2 else "masks": masks}
-            if scores is not None:
-                arrays["scores"] = np.asarray(scores, dtype=np.float64)
-            name = partial / f"{k}.npz"
-            np.savez_compressed(name, **arrays)  # type: ignore[arg-type]
-            _parsed({name: read_bytes(name, "masks")}, None, masks.shape[-2:])  # the checks of the reader
+            name, data = partial / f"{k}.npz", _packed(one)
+            masks = np.asarray(one[0] if isinstance(one, tuple) else one)
+            _parsed({name: data}, None, masks.shape[-2:])  # the checks of the reader
+            name.write_bytes(data)
         if weights is not None:
             write_text(partial / _WEIGHTS, json.dumps({f"{k}.npz": float(w) for k, w in enumerate(weights)}))
             read_weights(partial, _alternatives(partial))

@@ -1,15 +1,24 @@
-"""Hypotheses from instance masks that another program made.
+"""Hypotheses from instance masks: those of a segmenter of your own, or those in a folder.
 
->>> filter = mstfilter.preset("mst_rules", "proposal=mask_folder", "proposal.folder=masks")
->>> MaskProposal("masks").sample(np.random.default_rng(0), clip, 10)
+A segmenter is a class with one method, for example around a network. Each label image is one possible segmentation:
 
-`mstfilter.mst.frontends.mask_files` describes the folder. For each sample, an alternative segmentation of the image
-is drawn by weight, and then a cut of the tree of its masks. Each distinct mask is extended to a 3-D volume once.
+>>> class Mine(Segmenter):
+...     def segment(self, frame: Frame) -> list[np.ndarray]:
+...         return [my_network(frame.rgb)]
+>>> filter = replace(mstfilter.preset("mst"), proposal=Mine())     # or preset("mst", "proposal=./mine.py:Mine")
+
+Masks that another program has written are read from a folder (`mstfilter.mst.frontends.mask_files`):
+
+>>> filter = mstfilter.preset("mst", "proposal=mask_folder", "proposal.folder=masks")
+
+For each sample, an alternative segmentation of the image is drawn by weight, and then a cut of the tree of its masks.
+Each distinct mask is extended to a 3-D volume once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from abc import abstractmethod
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Protocol
 
@@ -18,53 +27,31 @@ import numpy as np
 from mstfilter.base.errors import warn_user
 from mstfilter.base.fields import Share
 from mstfilter.mst.completion import Completer, Extrude
-from mstfilter.mst.frontends.mask_files import has_masks, read_masks, write_masks
+from mstfilter.mst.frontends.mask_files import PauseMasks, has_masks, masks_of, read_masks, write_masks
 from mstfilter.mst.frontends.mask_trees import nested_masks, node_values
 from mstfilter.mst.segmentation import CutSampler, ExactCuts, ObjectRule, complete_segments
-from mstfilter.scene import Clip, Recording, UsesFiles, content_key
+from mstfilter.scene import Clip, Frame, Recording, UsesFiles, content_key
 from mstfilter.smc import Population, Proposal, child
 
 
-@dataclass(frozen=True)
-class MaskProposal(Proposal, UsesFiles):
-    """Hypotheses from a folder of instance masks with alternative segmentations.
+class _OfMasks(Proposal):
+    """Draws hypotheses from the alternatives of an image."""
 
-    Parameters
-    ----------
-    folder : str
-        The folder of masks.
-    sampler : CutSampler
-        Sampler of cuts of the tree of nested masks. At temperature 1, the cuts have the distribution that
-        `mstfilter.mst.frontends.mask_trees` defines.
-    objects : ObjectRule
-        Decides which masks are objects. The others, such as that of the table, are background; one that contains
-        further masks is always split into its parts.
-    completer : Completer
-    threshold : float
-        Smallest probability of an occupied voxel.
-    """
-
-    folder: str = ""
-    sampler: CutSampler = field(default_factory=lambda: ExactCuts(temperature=1.0))
-    objects: ObjectRule = field(default_factory=ObjectRule)
-    completer: Completer = field(default_factory=Extrude)
-    threshold: Share = 0.45
+    sampler: CutSampler
+    objects: ObjectRule
+    completer: Completer
+    threshold: float
 
     properly_weighted: ClassVar[bool] = False
 
-    def check_files(self, recording: Recording) -> None:
-        """Read the masks of all pauses."""
-        for clip in recording.clips():
-            read_masks(self.folder, clip.index, clip.after.depth.shape)
-        n = len(recording.pauses)
-        if has_masks(self.folder, n):
-            text = f"folder {self.folder} has masks with numbers above {n - 1}, but {recording.name} has {n} pauses"
-            warn_user(text, "masks are numbered by pause, from 0, and not by frame")
+    @abstractmethod
+    def _masks(self, clip: Clip) -> PauseMasks:
+        """The alternatives of the last image of a clip."""
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
         """Sample `n` hypotheses for the scene at the end of the clip, with equal weights."""
         frame, grid = observation.after, observation.grid
-        masks = read_masks(self.folder, observation.index, frame.depth.shape)
+        masks = self._masks(observation)
         chosen: list[list[int]] = [[] for _ in range(n)]
         pixels: dict[int, np.ndarray] = {}
         whole = _number(b"")  # names the random streams of the whole image
@@ -93,6 +80,71 @@ class MaskProposal(Proposal, UsesFiles):
         alternatives = np.bincount(drawn, minlength=len(masks.weights)).tolist()
         notes = {"masks": masks.key.hex(), "alternatives": alternatives, **counts}
         return Population(particles, notes=notes)
+
+
+@dataclass(frozen=True)
+class Segmenter(_OfMasks):
+    """Hypotheses from a segmentation of the image in Python: inherit it, and define `segment`.
+
+    Its fields are those of `MaskProposal`, without the folder.
+    """
+
+    sampler: CutSampler = field(default_factory=lambda: ExactCuts(temperature=1.0))
+    objects: ObjectRule = field(default_factory=ObjectRule)
+    completer: Completer = field(default_factory=Extrude)
+    threshold: Share = 0.45
+
+    @abstractmethod
+    def segment(self, frame: Frame) -> Sequence[np.ndarray | tuple[np.ndarray, Sequence[float] | np.ndarray]]:
+        """Segmentations of an image, each an alternative; one is enough. Called once for each pause.
+
+        An alternative is a label image (H, W) of integers, 0 where there is no object; or disjoint or nested masks
+        (n, H, W) bool; or a pair of such an array and its scores. `frame` has `rgb` (H, W, 3), `depth` (H, W) in
+        metres, NaN without a reading, and `camera`. Samples are drawn as `MaskProposal` draws them.
+        """
+
+    def _masks(self, clip: Clip) -> PauseMasks:
+        return masks_of(self.segment(clip.after), clip.after.depth.shape)
+
+
+@dataclass(frozen=True)
+class MaskProposal(_OfMasks, UsesFiles):
+    """Hypotheses from a folder of instance masks with alternative segmentations.
+
+    Parameters
+    ----------
+    folder : str
+        The folder of masks, of one recording.
+    sampler : CutSampler
+        Sampler of cuts of the tree of nested masks. At temperature 1, the cuts have the distribution that
+        `mstfilter.mst.frontends.mask_trees` defines.
+    objects : ObjectRule
+        Decides which masks are objects. The others, such as that of the table, are background; one that contains
+        further masks is always split into its parts.
+    completer : Completer
+    threshold : float
+        Smallest probability of an occupied voxel.
+    """
+
+    folder: str = ""
+    sampler: CutSampler = field(default_factory=lambda: ExactCuts(temperature=1.0))
+    objects: ObjectRule = field(default_factory=ObjectRule)
+    completer: Completer = field(default_factory=Extrude)
+    threshold: Share = 0.45
+
+    of_one_recording: ClassVar[bool] = True
+
+    def check_files(self, recording: Recording) -> None:
+        """Read the masks of all pauses."""
+        for clip in recording.clips():
+            read_masks(self.folder, clip.index, clip.after.depth.shape)
+        n = len(recording.pauses)
+        if has_masks(self.folder, n):
+            text = f"folder {self.folder} has masks with numbers above {n - 1}, but {recording.name} has {n} pauses"
+            warn_user(text, "masks are numbered by pause, from 0, and not by frame")
+
+    def _masks(self, clip: Clip) -> PauseMasks:
+        return read_masks(self.folder, clip.index, clip.after.depth.shape)
 
 
 def _number(content: bytes) -> int:

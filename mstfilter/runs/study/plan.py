@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mstfilter.base.errors import InputError, naming
+from mstfilter.base.registry import nested_components
 from mstfilter.formats import open_recording
 from mstfilter.lab.oracles import uses_truth
 from mstfilter.runs import as_json, code_version, component_files, library_versions
@@ -46,6 +47,7 @@ class Arm:
     key: str  #: hash of the configuration, the code and the files of the user
     uses_truth: tuple[str, ...]  #: classes of its components that use the ground truth
     reported_only: bool = False  #: not part of the comparisons whose p values are adjusted together
+    of_one_recording: str = ""  #: classes of its components with files of one recording
 
 
 @dataclass(frozen=True)
@@ -127,6 +129,14 @@ def make_plan(study: StudyConfig, overrides: Sequence[str] = ()) -> Plan:
             f"scenes and {len(study.seeds)} seeds",
             "split the study",
         )
+    for arm in arms:
+        if arm.of_one_recording and len(scenes) > 1:
+            raise InputError(
+                f"arm {arm.name!r}: the files of {arm.of_one_recording} belong to one recording, and the study has "
+                f"{len(scenes)} scenes",
+                "a segmenter in Python serves all scenes: mstfilter.mst.frontends.Segmenter",
+                "or make a study for each scene",
+            )
     runs = tuple(
         StudyRun(arm, scene, seed, _hash([arm.key, scene.key, seed]))
         for scene in scenes
@@ -142,7 +152,8 @@ def _arm(request: ArmRequest, versions: dict[str, str], code: str) -> Arm:
         files = component_files(filter)
     config = as_json(describe_filter(filter))
     key = _hash([config, files, versions, code])
-    return Arm(request.name, config, key, tuple(uses_truth(filter)), request.reported_only)
+    own = [type(part).__name__ for part in nested_components(filter) if getattr(part, "of_one_recording", False)]
+    return Arm(request.name, config, key, tuple(uses_truth(filter)), request.reported_only, ", ".join(own))
 
 
 def build_metric(spec: str | Mapping[str, Any]) -> Metric:

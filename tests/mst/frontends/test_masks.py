@@ -6,7 +6,7 @@ import io
 import json
 import zipfile
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from mstfilter.formats import write_image
 from mstfilter.mst.completion import Extrude
 from mstfilter.mst.frontends import (
     MaskProposal,
+    Segmenter,
     mask_tree,
     nested_masks,
     node_values,
@@ -90,6 +91,37 @@ def test_alternatives_and_levels_are_sampled_with_their_law(tmp_path):
     assert (population.log_weights == 0).all()
     counts = [found[one] for one in expected]
     assert chisquare(counts, 4000 * np.array(list(expected.values()))).pvalue > 1e-6
+
+
+@dataclass(frozen=True)
+class Given(Segmenter):
+    """The alternatives of `law`, but for their weights, which follow from the scores."""
+
+    def segment(self, frame):
+        left, right = halves(BOX[0], 1)
+        assert frame is CLIP.after
+        return [left + 2 * right.astype(int), (stack(BOX[0]), [0.5]), (stack(BOX[1], BOX[2]), [0.5, 0.5])]
+
+
+def test_a_segmenter_proposes_what_its_masks_would_from_a_folder(tmp_path):
+    write_masks(tmp_path, 0, Given().segment(CLIP.after))
+    one, other = (p.sample(np.random.default_rng(3), CLIP, 50) for p in (Given(), MaskProposal(str(tmp_path))))
+    assert [h.key for h in one.particles] == [h.key for h in other.particles]
+    assert len({segments_of(h) for h in one.particles}) == 3
+
+
+@pytest.mark.parametrize(
+    ("masks", "error"),
+    [
+        ([], "there are no masks"),
+        ([np.zeros((3, 4), int)], "3 x 4 pixels, the image is"),
+        ([np.full(SHAPE, 0.5)], "labels has shape .* and type float64"),
+    ],
+)
+def test_a_segmenter_that_returns_no_masks_of_the_image(monkeypatch, masks, error):
+    monkeypatch.setattr(Given, "segment", lambda self, frame: masks)
+    with pytest.raises(InputError, match=error):
+        Given().sample(np.random.default_rng(0), CLIP, 2)
 
 
 def test_the_weight_of_an_alternative_is_the_mean_score_of_its_largest_masks(tmp_path):

@@ -215,6 +215,9 @@ WRONG = {
     'seeds = "0-50000"\narms = [{set = "update.n_views=1,2,3,4,5,6,7,8,9,10,11,12,13,14,15,16,17,18,19,20,21"}]': (
         "1050021 runs, at most 1000000 are planned: 21 arms, 1 scenes and 50001 seeds"
     ),
+    'scenes = [{family = "demo", seeds = "1-2"}]\narms = [{set = "proposal=mask_folder"}]': (
+        "the files of MaskProposal belong to one recording, and the study has 2 scenes"
+    ),
     'reference = "mine"': "reference is 'mine', which is not an arm",
     "colour = 1": "fields of a study",
     'keep = "some"': "keep",
