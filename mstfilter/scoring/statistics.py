@@ -7,8 +7,8 @@
 >>> found = compare_arms(table, reference="ours")
 >>> [(arm, round(d.p_holm, 2)) for arm, d in found.items()]
 [('theirs', 0.5), ('floor', 0.5)]
->>> print(str(found).splitlines()[0][:61])                   # the conclusions in words; found.plot() draws them
-theirs and ours: no difference can be claimed at n = 3 (-0.16
+>>> print(str(found).splitlines()[0][:85])                   # the conclusions in words; found.plot() draws them
+theirs and ours: no difference can be claimed at n = 3, where p is never below 0.25 (
 
 `compare_runs`, which is also ``runs.compare(...)``, compares the errors of filters over the seeds of `run_many`.
 
@@ -252,7 +252,9 @@ def conclusion(difference: Difference, first: str, second: str, where: str = "",
         return f"{first} and {second}{at}: no difference can be claimed at n = 1."
     found = f"{d.mean:+#.3g}, 95 % interval {d.low:+#.3g} to {d.high:+#.3g}, p {d.p_holm:.2g} after Holm, n = {d.n}"
     if not d.p_holm < SIGNIFICANT:
-        return f"{first} and {second}{at}: no difference can be claimed at n = {d.n} ({found})."
+        least = 2.0 ** (1 - d.n)  # two of 2^n sign flips have a mean that is as large
+        few = f", where p is never below {least:.2g}" if least > SIGNIFICANT else ""
+        return f"{first} and {second}{at}: no difference can be claimed at n = {d.n}{few} ({found})."
     if not d.is_claim:
         return f"{first} minus {second}{at}: {found}. A first look: claims need {CLAIM} {unit}s."
     return f"{first} is {'above' if d.mean > 0 else 'below'} {second}{at} ({found})."
