@@ -44,6 +44,11 @@ def check(
     from mstfilter.smc.testing import FALSE_ALARM, CheckResult
 
     subject = _subject(component, overrides or [])
+    if getattr(subject, "of_one_recording", False):
+        raise InputError(
+            f"{component} reads the files of one recording, which the scenes of the test do not have",
+            "`mstfilter run RECORDING` with it checks the files of all pauses before it starts",
+        )
     name = component if is_model(subject) else type(subject).__name__
     if observations and not is_model(subject):
         raise InputError(f"observations are given, and {component} is no model", "leave --observations out")
