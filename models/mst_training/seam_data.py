@@ -3,7 +3,7 @@
 >>> samples = SeamSamples.of_scene(seed=0, index=3)             # always the same
 >>> samples.x.shape, samples.strip.shape, samples.purity
 
-Half of the scenes ask the question: in `row`, `stack` and `pack`, things that look like several objects are one as
+Most of the scenes ask the question: in `row`, `stack` and `pack`, things that look like several objects are one as
 often as not. The others are `s1` to `s3`. Cameras and sensors are drawn at random, sizes and textures are those for
 tuning. The regions are those that `SeamTree` examines in the tree `border`, and below those of several objects the
 sides of the best division. Some of the regions that plainly are one object are left out.

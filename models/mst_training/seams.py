@@ -96,7 +96,7 @@ class SeamsTraining(Training):
         """The mean loss of the regions."""
         x, strips, *truth = batch
         net = networks["net"]
-        if step == 0:  # the inputs are standardised by the first batch
+        if step == 0 and not self.start:  # the inputs are standardised by the first batch
             net.mean.copy_(x.mean(0))
             net.scale.copy_(x.std(0) + 0.05)
         total = region_losses(net(x, strips), *truth)[0].mean()

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mstfilter.base.errors import InputError
+from mstfilter.base.errors import InputError, InputWarning
 from mstfilter.smc import (
     Branching,
     Categorical,
@@ -299,6 +299,27 @@ def agrees(means, squares):
 
 
 STARTS = np.random.default_rng(0).normal(MEAN, np.sqrt(SQUARE), (40, 1))
+
+
+@pytest.mark.parametrize("batched", [False, True])
+def test_pmmh_rejects_parameters_for_which_the_model_is_invalid(batched):
+    """Above .6, the noise is 0 for some particles. The posterior is that of the prior without these values."""
+
+    def filter_of(theta):
+        noise = np.where(np.asarray(theta) > 0.6, 0.0, 1.0)
+        model = StateSpaceModel.of(
+            Normal(), lambda x: Normal(theta * x, 0.5), lambda x: Normal(x, noise * (1 + 0 * x))
+        )
+        return bootstrap(model, 10)
+
+    prior, start = Uniform(0.0, 1.0), [[0.2], [0.5]]
+    with pytest.raises(InputError, match=r"parameters \[0\.[6-9]"):
+        pmmh(filter_of, [0.1, 0.2], prior, start, 0.5, 30, batched=batched)
+    with pytest.warns(InputWarning, match="proposals were rejected because the model is invalid"):
+        chains = pmmh(filter_of, [0.1, 0.2], prior, start, 0.5, 30, batched=batched, invalid="reject")
+    assert chains.theta.max() <= 0.6 and len(np.unique(chains.theta)) > 5
+    with pytest.raises(InputError, match="invalid is 'skip', expected raise or reject"):
+        pmmh(filter_of, [0.1], prior, start, 0.5, 1, invalid="skip")
 
 
 def test_pmmh_has_the_exact_posterior():

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mstfilter.base.errors import InputError, check_integer, naming
+from mstfilter.base.errors import InputError, check_integer, naming, warn_user
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import Infos, State
 from mstfilter.smc.population import Population, as_matrix, union
@@ -89,6 +89,12 @@ class RunVariance:
     state: State  #: the last state of the run
     infos: Infos = field(default_factory=Infos)  #: of its steps
 
+    def __repr__(self) -> str:
+        if not len(self.log_evidence):
+            return "RunVariance of no step"
+        z, variance = self.log_evidence[-1], self.log_evidence_variance[-1]
+        return f"RunVariance after {len(self.log_evidence)} steps: log evidence {z:.6g}, its variance {variance:.3g}"
+
 
 def run_variance(
     filter: ParticleFilter,
@@ -120,6 +126,9 @@ def run_variance(
     at time 0. For the evidence, the part of V that arises at time s is evaluated at time s + L instead of t, and the
     parts are added. The lag reduces the noise of the estimates. With a lag, the variances can be estimated even if
     all particles share one ancestor at time 0. The bias from the lag is small if x_t hardly depends on x_{t-L}.
+
+    Without a lag, V never exceeds 1, its value when all particles have one ancestor at time 0: such a run contains no
+    information about its variance any more, and there is a warning. Give a lag, or use more particles.
 
     The estimated variances are of first order in 1 / n, and too low for small n. Use more particles if the log
     evidence has a variance above 0.3 (`experiments/run_variance`).
@@ -177,6 +186,8 @@ def run_variance(
         if until is not None and until(state):
             break
     columns = [np.array(column) for column in zip(*rows, strict=True)] or [np.zeros(0)] * 4
+    if lag is None and len(rows) > 1 and rows[-1][1] >= 1 - 1e-12:
+        warn_user("run_variance: all particles have one ancestor at time 0", "give a lag, or use more particles")
     return RunVariance(columns[0], columns[1], columns[2], columns[3], state, infos)
 
 

@@ -35,11 +35,11 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import islice
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from mstfilter.base.errors import InputError, LostRunError, check_integer
+from mstfilter.base.errors import InputError, LostRunError, check_choice, check_integer, naming, warn_user
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.first_steps import unexamined
 from mstfilter.smc.history import log_evidence
@@ -214,7 +214,9 @@ class _Posterior:
     observations: list[Any]
     parameters: _Parameters
     batched: bool = False
+    reject: bool = False  #: whether parameters for which the model is invalid have no evidence, instead of an error
     n_runs: int = 0  #: so far: the model is examined once
+    n_invalid: int = 0  #: of these, for parameters for which the model is invalid
 
     def filter_of(self, theta: np.ndarray) -> ParticleFilter:
         """The filter of parameters (d,), or (d, m) for a batch."""
@@ -238,15 +240,24 @@ class _Posterior:
         """Log evidences of filters that run in one sweep, or one by one if they cannot be swept."""
         if self.batched and self.observations:
             if can_sweep(self._filter(thetas[0])):
-                return self._in_one_sweep(thetas, seeds)
-            self.batched = False
-            warnings.warn("the filters are run one by one: a component looks at several particles", stacklevel=5)
+                if not self.n_runs:
+                    self._examine(thetas)
+                with suppress(InputError):  # the parameters at fault are then found one by one
+                    return self._in_one_sweep(thetas, seeds)
+            else:
+                self.batched = False
+                warnings.warn("the filters are run one by one: a component looks at several particles", stacklevel=5)
         found = np.full(len(thetas), -np.inf)
         for r, (theta, seed) in enumerate(zip(thetas, seeds, strict=True)):
-            with suppress(LostRunError), unexamined(self.n_runs > 0):
-                self.n_runs += 1
-                state, _ = self._filter(theta).run(self.observations, seed)
-                found[r] = state.log_evidence
+            self.n_runs += 1
+            try:
+                with suppress(LostRunError), unexamined(self.n_runs > 1), naming(f"parameters {theta.tolist()}"):
+                    state, _ = self._filter(theta).run(self.observations, seed)
+                    found[r] = state.log_evidence
+            except InputError:
+                if not self.reject:
+                    raise
+                self.n_invalid += 1
         return found
 
     def _filter(self, theta: np.ndarray) -> ParticleFilter:
@@ -258,9 +269,6 @@ class _Posterior:
     def _in_one_sweep(self, thetas: np.ndarray, seeds: list[int]) -> np.ndarray:
         """Log evidences of filters in one sweep. The components hold one parameter vector for each particle."""
         first = self._filter(thetas[0])
-        if not self.n_runs:
-            self._examine(first, thetas)
-        self.n_runs += len(thetas)
 
         @lru_cache(maxsize=4)
         def made(runs: tuple[int, ...]) -> ParticleFilter:
@@ -270,17 +278,22 @@ class _Posterior:
         runs = sweep_runs(
             first, self.observations, seeds, key, {"z": log_evidence}, lambda runs: made(tuple(runs.tolist()))
         )
-        return np.array([-np.inf if run.lost else run.rows["z"][-1] for run in runs])
+        found = np.array([-np.inf if run.lost else run.rows["z"][-1] for run in runs])
+        self.n_runs += len(thetas)
+        return found
 
-    def _examine(self, first: ParticleFilter, thetas: np.ndarray) -> None:
+    def _examine(self, thetas: np.ndarray) -> None:
         """Examine the model, and compare the weights of two parameter vectors together with those of each."""
-        with suppress(LostRunError):
+        first, different = self._filter(thetas[0]), False
+        harmless = (LostRunError, InputError) if self.reject else (LostRunError,)
+        with suppress(*harmless):
             list(islice(first.iterate(self.observations, 0), 3))
-        with suppress(LostRunError):
+        with suppress(*harmless):
             alone = [self.filter_of(theta) for theta in thetas[:2]]
             both = self.filter_of(np.repeat(thetas[:2], first.n, axis=0).T)
-            if len(alone) == 2 and sweep_difference(alone, both, self.observations) == "weights":
-                raise InputError(*DIFFERENT_WEIGHTS)
+            different = len(alone) == 2 and sweep_difference(alone, both, self.observations) == "weights"
+        if different:
+            raise InputError(*DIFFERENT_WEIGHTS)
 
 
 def pmmh(
@@ -294,6 +307,7 @@ def pmmh(
     *,
     n_chains: int = 1,
     batched: bool = False,
+    invalid: Literal["raise", "reject"] = "raise",
 ) -> Chains:
     """Particle marginal Metropolis-Hastings: a random walk on the parameters.
 
@@ -322,12 +336,17 @@ def pmmh(
         The filters of all chains then run as one batch. To combine a parameter with particles (n, k), use
         ``theta[0][..., None]``. If a component looks at several particles, the filters run one by one, with a
         warning.
+    invalid : "raise" or "reject"
+        What happens at parameters for which the model is invalid, such as a standard deviation that underflows to 0
+        or weights that are NaN: an error that names them, or a rejection of the proposal. Rejections end with one
+        warning that counts them; the posterior is then that of the prior restricted to valid parameters.
 
     Raises
     ------
     InputError
         If the prior is zero at the start of a chain, or if 20 estimates of the evidence at the start are zero.
     """
+    check_choice("invalid", invalid, ("raise", "reject"))
     parameters, key = _Parameters(prior, start), Key(seed).child("pmmh")
     check_integer("n_chains", n_chains)
     theta = parameters.start(start, n_chains, key.child("prior").generator())
@@ -337,7 +356,8 @@ def pmmh(
         raise InputError("scale is missing", "give the standard deviation of a step for each parameter")
     root = _step_root(parameters.vector("scale", scale), theta.shape[1])
     check_integer("n_iterations", n_iterations)
-    posterior = _Posterior(filter_of, list(check_observations(observations)), parameters, batched)
+    reject = invalid == "reject"
+    posterior = _Posterior(filter_of, list(check_observations(observations)), parameters, batched, reject)
 
     def propose(rng: np.random.Generator, now: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
         new = posterior(rng, now["theta"] + rng.standard_normal(theta.shape) @ root.T)
@@ -347,6 +367,11 @@ def pmmh(
     for i in range(n_iterations):
         [(state, accepted)] = metropolis(key.child(i).generator(), state, propose)
         steps.append({**state, "accepted": accepted})
+    if posterior.n_invalid:
+        n = posterior.n_invalid
+        warn_user(
+            f"pmmh: {n} proposals were rejected because the model is invalid at their parameters", "see `invalid`"
+        )
     found = {name: np.stack([step[name] for step in steps]) for name in steps[0]}
     accepted = found["accepted"].mean(axis=0)
     return Chains(found["theta"], found["log_evidence"], found["log_density"], accepted, shapes=parameters.shapes)
