@@ -301,6 +301,7 @@ def agrees(means, squares):
 STARTS = np.random.default_rng(0).normal(MEAN, np.sqrt(SQUARE), (40, 1))
 
 
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.parametrize("batched", [False, True])
 def test_pmmh_rejects_parameters_for_which_the_model_is_invalid(batched):
     """Above .6, the noise is 0 for some particles. The posterior is that of the prior without these values."""
