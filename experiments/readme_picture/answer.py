@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+import numpy as np
 
 import mstfilter
 from mstfilter import Belief
@@ -22,6 +23,7 @@ from mstfilter.lab.simulation import PushLoop, scene_family
 from mstfilter.mst.belief import push_candidates
 
 LEAST = 0.1  # borders with probabilities nearer to 0 or 1 are left out, for a picture that is quickly read
+REACH = ((-0.5, -0.5, 0.0), (0.5, 0.5, 0.4))
 
 
 def main() -> None:
@@ -42,18 +44,21 @@ def main() -> None:
     belief, camera = Belief.of_step(state, info), loop.clip.after.camera
     table = belief.objects()
     shown = [(loop.clip.after.rgb, Answer.of(belief, table, camera))]
-    pushes = push_candidates(belief, camera, (belief.grid.origin, belief.grid.upper))
+    pushes = push_candidates(belief, camera, REACH)
     if pushes:
         state, info = mst.step(state, loop.play(pushes[0]))
         belief = Belief.of_step(state, info)
         shown.append((loop.clip.after.rgb, Answer.of(belief, belief.objects(previous=table), camera)))
     _, _, width, height = shown[0][1].box
     figure, axes = plt.subplots(1, len(shown), figsize=(12, 6 * height / width), layout="constrained", squeeze=False)
-    for k, (place, (image, answer)) in enumerate(zip(axes[0], shown, strict=True)):
+    for place, (image, answer) in zip(axes[0], shown, strict=True):
         print(*answer.sentences)
         borders = [one for one in answer.borders if LEAST < one.one_object < 1 - LEAST]
-        push = None if k else answer.push  # the one that is played
-        draw_answer(place, replace(answer, box=shown[0][1].box, borders=borders, push=push), image)
+        draw_answer(place, replace(answer, box=shown[0][1].box, borders=borders, push=None), image)
+    for push in pushes[:1]:
+        (x, y), (u, v) = camera.project(np.array([push.contact - 0.06 * push.direction, push.contact]))[0]
+        arrow = {"arrowstyle": "-|>,head_width=0.5,head_length=0.9", "color": "#f6f6f2", "lw": 4}
+        axes[0, 0].annotate("", (u, v), (x, y), arrowprops=arrow)
     figure.savefig(options.out, dpi=100)
 
 

@@ -272,12 +272,7 @@ SCENE_FAMILIES |= {
     "row": replace(_GROUPED, name="row", n_objects_min=3, n_objects_max=5, groups="row", n_groups=2),
     "stack": replace(_GROUPED, name="stack", n_objects_min=3, n_objects_max=5, groups="stack", n_groups=2),
     "pack": replace(_GROUPED, name="pack", n_objects_min=2, n_objects_max=4, groups="pack", n_groups=1),
-    # A row that is one object or several, pushes that tell, and objects that get hidden: the demo.
-    "puzzle": replace(
-        SCENE_FAMILIES["occlusion"], name="puzzle", n_objects_min=5, n_objects_max=6, n_hidden=1, groups="row",
-        n_groups=1, push_aims="apart, nothing",
-    ),
-}  # fmt: skip
+}
 
 
 def scene_family(name: str) -> SceneFamily:
