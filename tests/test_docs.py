@@ -69,6 +69,7 @@ def test_examples_run(page, tmp_path, capsys, monkeypatch):
         "rgb": np.stack([s[0] for s in scenes]),
         "depth": np.stack([s[1] for s in scenes]),
         "K": CAMERA.K,
+        "pauses": [0, 1, 2],
         "hypotheses": [Hypothesis.from_labels(s[2], GRID) for s in scenes],
     }
     given["segment"] = lambda image: [next(_shown(s[2]) for s in scenes if (s[0] == image).all())]

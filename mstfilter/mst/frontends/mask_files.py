@@ -133,7 +133,7 @@ def read_weights(folder: Path, files: list[Path]) -> list[float] | None:
     return [float(weights[p.name]) for p in files]
 
 
-def masks_of(
+def alternatives_of(
     alternatives: Sequence[np.ndarray | tuple[np.ndarray, Sequence[float] | np.ndarray]], shape: tuple[int, int]
 ) -> PauseMasks:
     """The alternatives of an image of `shape` (H, W), as `write_masks` takes them. InputError if one is invalid."""

@@ -27,7 +27,7 @@ import numpy as np
 from mstfilter.base.errors import warn_user
 from mstfilter.base.fields import Share
 from mstfilter.mst.completion import Completer, Extrude
-from mstfilter.mst.frontends.mask_files import PauseMasks, has_masks, masks_of, read_masks, write_masks
+from mstfilter.mst.frontends.mask_files import PauseMasks, alternatives_of, has_masks, read_masks, write_masks
 from mstfilter.mst.frontends.mask_trees import nested_masks, node_values
 from mstfilter.mst.segmentation import CutSampler, ExactCuts, ObjectRule, complete_segments
 from mstfilter.scene import Clip, Frame, Recording, UsesFiles, content_key
@@ -104,7 +104,7 @@ class Segmenter(_OfMasks):
         """
 
     def _masks(self, clip: Clip) -> PauseMasks:
-        return masks_of(self.segment(clip.after), clip.after.depth.shape)
+        return alternatives_of(self.segment(clip.after), clip.after.depth.shape)
 
 
 @dataclass(frozen=True)
