@@ -122,7 +122,7 @@ class Answer:
         image = _label_image(belief, camera)
         tags = _Tags(camera.width, camera.height, _APART * shown * camera.width)
         number_of = {one.label: one.number for one in table if one.in_estimate}
-        open_borders, meeting = [], []
+        open_borders, asked, meeting = [], [], []
         for border in belief.open_borders(camera):
             numbers = _numbers(border, image, number_of)
             if len(numbers) == 2 and table.by_number(numbers[0]).one_with.get(numbers[1], 0.0) <= _SURE:
@@ -134,6 +134,7 @@ class Answer:
             tag = tags.place(share(border.one_object), (x + 0.5, y + 0.5), beside=True)
             around = _polygons(_grown(thick, max(1, round(shown * camera.width / 320))))
             open_borders.append(OpenBorder(border.one_object, numbers, around, tag))
+            asked.append(border)
         masks = [_mask(belief, one, image, camera) for one in table]
         order = np.argsort([-int(mask.sum()) for mask in masks], kind="stable").tolist()
         found: dict[int, Outline] = {}
@@ -143,7 +144,7 @@ class Answer:
             around = _polygons(masks[k].astype(np.uint8), outer=True)
             found[k] = Outline(one.number, not one.visible, around, named)
         outlines = tuple(found[k] for k in range(len(table)))
-        push = _push(belief, camera, number_of) if open_borders else None
+        push = _push(belief, camera, asked, number_of) if asked else None
         return cls(table, box, outlines, tuple(open_borders), tuple(dict.fromkeys(meeting)), push)
 
     @cached_property
@@ -379,14 +380,14 @@ def _parts(old: dict[int, BelievedObject], new: dict[int, BelievedObject]) -> di
     return found
 
 
-def _push(belief: Belief, camera: Camera, number_of: Mapping[int, int]) -> Arrow | None:
-    """The most informative push of a tool that reaches the whole grid."""
+def _push(belief: Belief, camera: Camera, borders: Sequence[Border], number_of: Mapping[int, int]) -> Arrow | None:
+    """The most informative push along one of some borders, of a tool that reaches the whole grid."""
     grid = belief.grid
     if camera.T_world_camera is None or not belief.estimate().n_objects:
         return None
     for best in push_candidates(belief, camera, (grid.origin, grid.upper)):
         number = number_of.get(best.label)
-        if number is not None:
+        if number is not None and any(np.array_equal(best.border.pixels, one.pixels) for one in borders):
             (x, y), (u, v) = camera.project(np.array([best.contact - _ARROW * best.direction, best.contact]))[
                 0
             ].tolist()

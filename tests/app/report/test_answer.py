@@ -65,6 +65,18 @@ def test_two_objects_whose_common_border_is_uncertain_have_no_open_border():
     ]
 
 
+def test_the_push_asks_about_an_open_border():
+    """Where two objects meet is uncertain by 1 cm, and a third one is perhaps two: the push is along the latter."""
+    other, parts = (np.s_[8:17, 15:22, :9], np.s_[17:24, 15:22, :9]), (np.s_[30:36, 8:15, :5], FAR)
+    whole = list(parts)
+    belief = belief_of(
+        (0.5, scene(LEFT, RIGHT, whole)), (0.43, scene(*other, whole)), (0.07, scene(*other, *parts))
+    )  # more is to be learned about where the first two meet
+    answer = answer_of(belief)
+    assert answer.meeting and len(answer.borders) == 1
+    assert answer.push is not None and answer.push.number in answer.borders[0].numbers
+
+
 def test_an_object_that_is_perhaps_somewhere_else():
     """A hidden object with the record of a visible one is another place of it, and nothing that is remembered."""
     moved, kept = scene(LEFT, FAR), scene(LEFT, HIDDEN, hidden=(2,))
