@@ -150,8 +150,8 @@ class Answer:
     @cached_property
     def sentences(self) -> list[str]:
         """How many objects there are, what is hidden, and what is open."""
-        seen = {(one.record.id, one.record.birth): one.number for one in self.table if one.visible}
-        unseen = [(one, seen.get((one.record.id, one.record.birth))) for one in self.table if not one.visible]
+        seen = {one.lineage: one.number for one in self.table if one.visible}
+        unseen = [(one, seen.get(one.lineage)) for one in self.table if not one.visible]
         hidden = [one for one, visible in unseen if visible is None]
         found = [f"{_count(len(self.table) - len(unseen), 'object')} in view."]
         if hidden:
@@ -256,7 +256,7 @@ def changes(before: ObjectTable, now: ObjectTable) -> list[str]:
     both = [(old[k], new[k]) for k in sorted(old.keys() & new.keys())]
     parts = _parts(old, new)
     found = []
-    shifts = [(b.number, _shift(a, b)) for a, b in both if b.number not in parts or _descends(a, b)]
+    shifts = [(b.number, _shift(a, b)) for a, b in both if b.number not in parts or a.lineage == b.lineage]
     moved = [f"{k} (by {100 * shift:.0f} cm)" for k, shift in shifts if shift > _MOVED]
     if moved:
         found.append(f"Moved: {_listed(moved)}.")
@@ -291,15 +291,10 @@ def changes(before: ObjectTable, now: ObjectTable) -> list[str]:
 
 def _shift(before: BelievedObject, now: BelievedObject) -> float:
     """How far the middle of an object has moved, metres. What only its new shape has moved does not count."""
-    if _descends(before, now):
+    if before.lineage == now.lineage:
         motion = now.pose * before.pose.inv()
         return float(np.linalg.norm(motion.apply(before.centre) - before.centre))
     return float(np.linalg.norm(now.centre - before.centre))
-
-
-def _descends(before: BelievedObject, now: BelievedObject) -> bool:
-    """Whether both are one object of hypotheses that descend from one another."""
-    return (before.record.id, before.record.birth) == (now.record.id, now.record.birth)
 
 
 #: The columns of the table of objects: keys of `table_cells`, and their heads.
@@ -385,12 +380,11 @@ def _push(belief: Belief, camera: Camera, borders: Sequence[Border], number_of: 
     grid = belief.grid
     if camera.T_world_camera is None or not belief.estimate().n_objects:
         return None
-    for best in push_candidates(belief, camera, (grid.origin, grid.upper)):
+    for best in push_candidates(belief, camera, (grid.origin, grid.upper), borders=borders):
         number = number_of.get(best.label)
-        if number is not None and any(np.array_equal(best.border.pixels, one.pixels) for one in borders):
-            (x, y), (u, v) = camera.project(np.array([best.contact - _ARROW * best.direction, best.contact]))[
-                0
-            ].tolist()
+        if number is not None:
+            ends = np.array([best.contact - _ARROW * best.direction, best.contact])
+            (x, y), (u, v) = camera.project(ends)[0].tolist()
             return Arrow((x, y), (u, v), number)
     return None
 

@@ -90,6 +90,11 @@ class BelievedObject:
         return self.record.pose
 
     @property
+    def lineage(self) -> tuple[int, int]:
+        """Id and birth of its record: equal for one object in hypotheses that descend from one another."""
+        return self.record.id, self.record.birth
+
+    @property
     def shift(self) -> np.ndarray:
         """(3,) metres, how far its middle has moved since the object was first proposed."""
         return np.asarray(self.centre - self.pose.inv().apply(self.centre))
@@ -205,7 +210,7 @@ def _numbered(table: ObjectTable, previous: ObjectTable | None) -> ObjectTable:
     last = 0 if previous is None else previous.last_number
     score = np.zeros((len(table), len(earlier)))
     for (r, now), (k, before) in product(enumerate(table), enumerate(earlier)):
-        descends = (now.record.id, now.record.birth) == (before.record.id, before.record.birth)
+        descends = now.lineage == before.lineage
         score[r, k] = _jaccard(now.shape, before.shape) + _DESCENT * descends + _ALIKE * _likeness(now, before)
     pairs = zip(*linear_sum_assignment(-score), strict=True)
     known = {int(r): earlier[k].number for r, k in pairs if score[r, k] >= _LEAST_SCORE}

@@ -12,6 +12,7 @@ The border, its two sides and their probabilities are those of `Belief.open_bord
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -71,6 +72,7 @@ def push_candidates(
     clearance: float = 0.05,
     tool_radius: float = 0.012,
     at_least: float = 0.05,
+    borders: Sequence[Border] | None = None,
 ) -> list[PushCandidate]:
     """Pushes along the open borders of a belief, the most informative first; none if no border is open.
 
@@ -89,6 +91,8 @@ def push_candidates(
         Metres.
     at_least : float
         As in `Belief.open_borders`.
+    borders : sequence of Border, optional
+        The borders to ask about, if only some of the open ones matter.
 
     Raises InputError without a pose of the camera, for a reach that is no box or contains no part of the grid, and
     for a belief without objects.
@@ -107,7 +111,8 @@ def push_candidates(
         raise InputError("the belief has no objects, so there is nothing to push")
     depth = render_hypothesis(estimate, camera).depth
     scene = _Scene(belief, camera, camera.unproject(depth.astype(np.float32)), box, length, clearance, tool_radius)
-    found = [push for border in belief.open_borders(camera, at_least) for push in scene.pushes(border)]
+    asked = belief.open_borders(camera, at_least) if borders is None else borders
+    found = [push for border in asked for push in scene.pushes(border)]
     return sorted(found, key=lambda push: -push.information)
 
 
