@@ -2,6 +2,7 @@
 
 >>> object_rows(run)                                    # a flat row for each pause and object
 >>> pause_documents(run, [run.n_pauses - 1])            # for JSON: objects and open borders of the last pause
+>>> pause_documents(run, reach=((-0.4, -0.4, 0.0), (0.4, 0.4, 0.3)))    # and the pushes that tell most
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 from mstfilter.base.errors import InputError
-from mstfilter.mst.belief import OBJECT_COLUMNS, flat_row, pause_document
+from mstfilter.mst.belief import OBJECT_COLUMNS, flat_row, pause_document, push_candidates
 from mstfilter.scoring import FORMS
 
 if TYPE_CHECKING:
@@ -46,13 +47,22 @@ def object_rows(run: RunFolder, pauses: Iterable[int] | None = None) -> list[dic
     return [{"pause": t, "time": times[t], **flat_row(row)} for t in chosen for row in tables[t].rows()]
 
 
-def pause_documents(run: RunFolder, pauses: Iterable[int] | None = None) -> list[dict[str, Any]]:
-    """The `pause_document` of each of these pauses, by default of all, with its number and its time in seconds."""
-    times, tables = run.description["recording"]["times"], run.tables()
-    chosen = range(run.n_pauses) if pauses is None else pauses
-    return [
-        pause_document(tables[t], run.belief(t).open_borders(run.camera(t)), pause=t, time=times[t]) for t in chosen
-    ]
+def pause_documents(run: RunFolder, pauses: Iterable[int] | None = None, reach: Any = None) -> list[dict[str, Any]]:
+    """The `pause_document` of each of these pauses, by default of all, with its number, image and time in seconds.
+
+    With the `reach` of a robot, each also has the `push_candidates`.
+    """
+    known, tables = run.description["recording"], run.tables()
+    documents = []
+    for t in range(run.n_pauses) if pauses is None else pauses:
+        belief, camera = run.belief(t), run.camera(t)
+        about = {"pause": t, "frame": known["pauses"][t], "time": known["times"][t]}
+        borders = belief.open_borders(camera)
+        if reach is not None:
+            pushes = push_candidates(belief, camera, reach, borders=borders) if len(tables[t]) else []
+            about["pushes"] = [push.row() for push in pushes]
+        documents.append(pause_document(tables[t], borders, **about))
+    return documents
 
 
 def chosen_pauses(run: RunFolder, pause: int | None) -> list[int]:

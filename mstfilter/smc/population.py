@@ -213,9 +213,8 @@ def _check_log_weights(lw: np.ndarray, n: int) -> float:
         wrong = np.flatnonzero(~(lw < np.inf))
         raise InputError(
             f"log weight of particle {wrong[0]} is {lw[wrong[0]]} ({len(wrong)} of {n} are NaN or +inf)",
-            "is the observation NaN? one that is missing is None"
-            if np.isnan(lw).all()
-            else "is a parameter of a distribution out of range, such as a negative scale?",
+            "is a parameter of a distribution out of range, such as a scale of 0?",
+            *["is the observation NaN? one that is missing is None"] * bool(np.isnan(lw).all()),
         )
     if top == -np.inf:
         raise LostRunError(

@@ -10,6 +10,7 @@ import pytest
 
 from mstfilter.base.errors import InputError
 from mstfilter.base.files import damaged_files
+from mstfilter.mst.belief import push_candidates
 from mstfilter.runs import RUN_FILES, TABLE_COLUMNS, chosen_pauses, object_rows, pause_documents
 from tests.app.report.runs import make_run, truth_at
 from tests.app.test_cli import call
@@ -81,8 +82,12 @@ def test_one_pause_csv_and_json(run, tmp_path, capsys):
     code, out, _ = call("objects", run.path, "--json", "--pause", 1, capsys=capsys)
     [one] = json.loads(out)
     assert one["pause"] == 1 and one["objects"] == json.loads(json.dumps(run.objects(1).rows()))
+    assert one["frame"] == run.description["recording"]["pauses"][1]
     borders = run.belief(1).open_borders(run.camera(1))
     assert [border["one_object"] for border in one["open_borders"]] == [round(b.one_object, 4) for b in borders]
+    code, out, _ = call(*("objects", run.path, "--json", "--pause", 1, "--reach", -1, -1, 0, 1, 1, 1), capsys=capsys)
+    pushes = push_candidates(run.belief(1), run.camera(1), ((-1, -1, 0), (1, 1, 1)))
+    assert json.loads(out)[0]["pushes"] == [push.row() for push in pushes]
     call("objects", run.path, "--out", tmp_path / "all.json", capsys=capsys)
     assert json.loads((tmp_path / "all.json").read_text()) == json.loads(json.dumps(pause_documents(run)))
     call("objects", run.path, "--out", tmp_path / "all.csv", capsys=capsys)
@@ -98,6 +103,8 @@ def test_one_pause_csv_and_json(run, tmp_path, capsys):
         (("--pause", -4), "has no pause -4"),
         (("--out", "objects.xlsx"), "ending of a table of objects is '.xlsx', expected .csv or .json"),
         (("--json", "--out", "objects.csv"), "ask for two formats"),
+        (("--reach", -1, -1, 0, 1, 1, 1), "only JSON has pushes"),
+        (("--json", "--reach", 1, 1, 1, 0, 0, 0), "expected two corners of a box"),
         (("--out", "absent/folder/objects.csv"), "absent"),
     ],
 )

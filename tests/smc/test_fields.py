@@ -102,7 +102,10 @@ def test_faults_of_models_are_named(make, message):
 def test_hints_say_what_was_meant():
     with pytest.raises(InputError) as raised:
         Population(np.zeros(2), np.full(2, np.nan))
-    assert raised.value.hints == ("is the observation NaN? one that is missing is None",)
+    assert raised.value.hints == (
+        "is a parameter of a distribution out of range, such as a scale of 0?",
+        "is the observation NaN? one that is missing is None",
+    )
 
     with pytest.raises(InputError) as raised:
         EssBelow(50)

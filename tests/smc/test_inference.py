@@ -321,6 +321,17 @@ def test_pmmh_rejects_parameters_for_which_the_model_is_invalid(batched):
     assert chains.theta.max() <= 0.6 and len(np.unique(chains.theta)) > 5
     with pytest.raises(InputError, match="invalid is 'skip', expected raise or reject"):
         pmmh(filter_of, [0.1], prior, start, 0.5, 1, invalid="skip")
+    with pytest.raises(InputError, match=r"\[0.9\]"):  # a start must be valid
+        pmmh(filter_of, [0.1], prior, [[0.9]], 0.5, 1, batched=batched, invalid="reject")
+
+    def strict(theta):
+        if np.max(theta) > 0.6:
+            raise InputError("too large")
+        return filter_of(theta)
+
+    with pytest.warns(InputWarning, match="proposals were rejected because the model is invalid"):
+        chains = pmmh(strict, [0.1, 0.2], prior, start, 0.5, 30, batched=batched, invalid="reject")
+    assert chains.theta.max() <= 0.6 and len(np.unique(chains.theta)) > 5
 
 
 def test_pmmh_has_the_exact_posterior():

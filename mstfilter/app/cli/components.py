@@ -134,7 +134,9 @@ def new(
 
     commands = write_starter(kind, path, target)
     print(f"component   {path}")
-    if any("demo/recording" in command for command in commands) and not Path("demo/recording").exists():
-        print("first       mstfilter demo")
+    missing = not Path("demo/recording").exists()
     for command in commands:
+        if missing and "demo/recording" in command:
+            print("next        mstfilter demo      # makes the recording of the next command")
+            missing = False
         print(f"next        {command}")

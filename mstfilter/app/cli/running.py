@@ -184,6 +184,12 @@ def objects(
     pause: Annotated[int | None, typer.Option(help="One pause, from 0; -1 is the last. Default: all.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, with the open borders.")] = False,
     out: Annotated[Path | None, typer.Option(help="File to write instead: .csv or .json.")] = None,
+    reach: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option(
+            metavar="X Y Z X Y Z", help="What a robot reaches, metres: JSON then has the pushes that tell most."
+        ),
+    ] = None,
 ) -> None:
     """Print the objects of a run: where, how certain, visible or hidden, which other object they may belong to."""
     from mstfilter.runs import TABLE_COLUMNS, RunFolder, chosen_pauses, object_rows, pause_documents
@@ -193,12 +199,14 @@ def objects(
         check_choice("ending of a table of objects", out.suffix.lower(), (".csv", ".json"))
         if as_json and out.suffix.lower() == ".csv":
             raise InputError(f"--json and --out {out} ask for two formats", "the ending of --out decides")
+    if reach is not None and not as_json and (out is None or out.suffix.lower() == ".csv"):
+        raise InputError("only JSON has pushes", "use --json, or --out with a .json file")
     folder = RunFolder.open(run)
     chosen = chosen_pauses(folder, pause)
     if out is not None and out.suffix.lower() == ".csv":
         write_csv(out, object_rows(folder, chosen), TABLE_COLUMNS)
     elif out is not None or as_json:
-        text = json.dumps(pause_documents(folder, chosen)) + "\n"
+        text = json.dumps(pause_documents(folder, chosen, reach and (reach[:3], reach[3:]))) + "\n"
         if out is None:
             sys.stdout.write(text)
         else:

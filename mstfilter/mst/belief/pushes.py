@@ -46,6 +46,12 @@ class PushCandidate:
     clearance: float  #: metres of free way before the contact
     label: int  #: of the object of `Belief.estimate` that is touched
 
+    def row(self) -> dict[str, Any]:
+        """Where to push and what it tells, as plain types."""
+        points = {"start": self.start, "contact": self.contact, "end": self.end, "direction": self.direction}
+        lists = {name: np.round(point, 5).tolist() for name, point in points.items()}
+        return {"information": round(self.information, 4), **lists, "border": self.border.middle.tolist()}
+
     def __repr__(self) -> str:
         (x, y, z), (a, b, _) = self.contact, self.direction
         return (

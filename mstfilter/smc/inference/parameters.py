@@ -239,14 +239,14 @@ class _Posterior:
     def _estimates(self, thetas: np.ndarray, seeds: list[int]) -> np.ndarray:
         """Log evidences of filters that run in one sweep, or one by one if they cannot be swept."""
         if self.batched and self.observations:
-            if can_sweep(self._filter(thetas[0])):
+            if not self.n_runs and not can_sweep(self._filter(thetas[0])):
+                self.batched = False
+                warnings.warn("the filters are run one by one: a component looks at several particles", stacklevel=5)
+            else:
                 if not self.n_runs:
                     self._examine(thetas)
                 with suppress(InputError):  # the parameters at fault are then found one by one
                     return self._in_one_sweep(thetas, seeds)
-            else:
-                self.batched = False
-                warnings.warn("the filters are run one by one: a component looks at several particles", stacklevel=5)
         found = np.full(len(thetas), -np.inf)
         for r, (theta, seed) in enumerate(zip(thetas, seeds, strict=True)):
             self.n_runs += 1
@@ -285,10 +285,9 @@ class _Posterior:
     def _examine(self, thetas: np.ndarray) -> None:
         """Examine the model, and compare the weights of two parameter vectors together with those of each."""
         first, different = self._filter(thetas[0]), False
-        harmless = (LostRunError, InputError) if self.reject else (LostRunError,)
-        with suppress(*harmless):
+        with suppress(LostRunError), naming(f"parameters {thetas[0].tolist()}"):
             list(islice(first.iterate(self.observations, 0), 3))
-        with suppress(*harmless):
+        with suppress(LostRunError):
             alone = [self.filter_of(theta) for theta in thetas[:2]]
             both = self.filter_of(np.repeat(thetas[:2], first.n, axis=0).T)
             different = len(alone) == 2 and sweep_difference(alone, both, self.observations) == "weights"
@@ -339,7 +338,8 @@ def pmmh(
     invalid : "raise" or "reject"
         What happens at parameters for which the model is invalid, such as a standard deviation that underflows to 0
         or weights that are NaN: an error that names them, or a rejection of the proposal. Rejections end with one
-        warning that counts them; the posterior is then that of the prior restricted to valid parameters.
+        warning that counts them; the posterior is then that of the prior restricted to valid parameters. At the start
+        of a chain the model must be valid, so a mistake in the set-up is an error.
 
     Raises
     ------
@@ -356,14 +356,14 @@ def pmmh(
         raise InputError("scale is missing", "give the standard deviation of a step for each parameter")
     root = _step_root(parameters.vector("scale", scale), theta.shape[1])
     check_integer("n_iterations", n_iterations)
-    reject = invalid == "reject"
-    posterior = _Posterior(filter_of, list(check_observations(observations)), parameters, batched, reject)
+    posterior = _Posterior(filter_of, list(check_observations(observations)), parameters, batched)
 
     def propose(rng: np.random.Generator, now: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
         new = posterior(rng, now["theta"] + rng.standard_normal(theta.shape) @ root.T)
         return new, new["log_density"] - now["log_density"]
 
     state, steps = _start(posterior, key.child("start"), theta), []
+    posterior.reject = invalid == "reject"  # from now on: a model that is invalid everywhere is a mistake
     for i in range(n_iterations):
         [(state, accepted)] = metropolis(key.child(i).generator(), state, propose)
         steps.append({**state, "accepted": accepted})

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -41,6 +43,9 @@ def test_pushes_go_along_the_border_and_touch_one_side():
         assert abs(push.contact[1] - face) < 0.011
         assert np.isclose(push.information, np.log(2), atol=0.02)
         assert np.allclose(push.end - push.start, 0.1 * push.direction)
+        row = json.loads(json.dumps(push.row()))
+        assert np.allclose(row["contact"], push.contact, atol=1e-5)
+        assert np.isclose(row["information"], push.information, atol=1e-4)
 
 
 def test_the_most_informative_push_asks_the_most_open_question():

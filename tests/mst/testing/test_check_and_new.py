@@ -78,8 +78,8 @@ def test_every_kind_has_a_starting_file():
 def test_a_starting_file_is_for_scenes_if_there_is_one(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     _, out, _ = call("new", "transition", "a.py", capsys=capsys)
+    assert re.search("next +mstfilter check .*\nnext +mstfilter demo .*\nnext +mstfilter run demo/recording", out)
     assert "run demo/recording transition=./a.py:MyTransition --out runs/mine --replace" in out
-    assert "first       mstfilter demo" in out
     _, out, _ = call("new", "transition", "b.py", "--for", "numbers", capsys=capsys)
     assert "python b.py" in out
     _, out, _ = call("new", "codec", "sub/c.py", capsys=capsys)
