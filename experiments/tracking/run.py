@@ -79,7 +79,9 @@ def turned(T: np.ndarray) -> float:
 def measure(path: Path, transition: TrackingTransition) -> list[dict]:
     """One row for each object and clip of a simulated recording."""
     recording, manifest = open_recording(path), json.loads((path / "manifest.json").read_text())
-    family = SceneFamily(**{f.name: manifest["family"][f.name] for f in fields(SceneFamily)})
+    family = SceneFamily(
+        **{f.name: manifest["family"][f.name] for f in fields(SceneFamily) if f.name in manifest["family"]}
+    )
     seed = manifest["seed"]
     shapes = draw_objects(stream(seed, "things"), family, family.pool(seed)).shapes
     surfaces = [surface_points(shape) for shape in shapes]
