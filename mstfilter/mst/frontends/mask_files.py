@@ -34,6 +34,9 @@ _WEIGHTS = "weights.json"
 _KINDS = {"labels": (2, "iu", "integers (H, W)"), "masks": (3, "b", "bool (n, H, W)")}
 
 
+_Masks = tuple[np.ndarray, np.ndarray]  # label image (H, W) or masks (n, H, W), and the score (n,) of each mask
+
+
 @dataclass(frozen=True, eq=False)
 class PauseMasks:
     """The alternative segmentations of a pause."""
@@ -58,7 +61,11 @@ def read_masks(folder: str | Path, pause: int, shape: tuple[int, int]) -> PauseM
     weights = read_weights(where, files) if len(files) > 1 else None
     named = (part for path, data in content.items() for part in (path.name, data))
     key = content_key("masks", shape, weights, *named)
-    return memo("mask_files", key, lambda: _parsed(content, weights, shape, key))
+
+    def parsed() -> PauseMasks:
+        return _pause_masks({path: _read(path, data, shape) for path, data in content.items()}, weights, key)
+
+    return memo("mask_files", key, parsed)
 
 
 def _entries(folder: Path) -> list[Path]:
@@ -139,30 +146,26 @@ def alternatives_of(
     """The alternatives of an image of `shape` (H, W), as `write_masks` takes them. InputError if one is invalid."""
     if not len(alternatives):
         raise InputError("there are no masks", "for an image without objects, give a label image of zeros")
-    content = {Path(f"alternative {k}.npz"): _packed(one) for k, one in enumerate(alternatives)}
-    return _parsed(content, None, shape, content_key("masks", shape, *content.values()))
+    found: dict[Path, _Masks] = {}
+    for k, one in enumerate(alternatives):
+        name = Path(f"alternative {k}")
+        found[name] = _checked(name, _arrays(one), shape)
+    return _pause_masks(found, None, content_key("masks", shape, *(a for pair in found.values() for a in pair)))
 
 
-def _packed(one: np.ndarray | tuple[np.ndarray, Sequence[float] | np.ndarray]) -> bytes:
-    """An alternative as an npz file."""
+def _arrays(one: np.ndarray | tuple[np.ndarray, Sequence[float] | np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays of an alternative by their names in an npz file."""
     masks, scores = one if isinstance(one, tuple) else (one, None)
     masks = np.asarray(masks)
-    arrays: dict[str, np.ndarray] = {"labels" if masks.ndim == 2 else "masks": masks}
-    if scores is not None:
-        arrays["scores"] = np.asarray(scores, dtype=np.float64)
-    file = io.BytesIO()
-    np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
-    return file.getvalue()
+    named = {"labels" if masks.ndim == 2 else "masks": masks}
+    return named if scores is None else {**named, "scores": np.asarray(scores, dtype=np.float64)}
 
 
-def _parsed(
-    content: Mapping[Path, bytes], weights: Sequence[float] | None, shape: tuple[int, int], key: bytes = b""
-) -> PauseMasks:
-    """Parse the alternatives from the content of files."""
+def _pause_masks(found: Mapping[Path, _Masks], weights: Sequence[float] | None, key: bytes) -> PauseMasks:
+    """The alternatives as trees. Without weights, these are the mean scores."""
     trees, stops, means = [], [], []
-    for path, data in content.items():
+    for path, (masks, scores) in found.items():
         with naming(str(path)):
-            masks, scores = (_read_png if path.suffix == ".png" else _read_npz)(path, data, shape)
             tree, stop = (label_tree if masks.ndim == 2 else mask_tree)(masks, scores)
         trees.append(tree)
         stops.append(stop)
@@ -196,9 +199,14 @@ def _check_shape(path: Path, found: Sequence[int], shape: tuple[int, int]) -> No
         )
 
 
-def _read_png(path: Path, data: bytes, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    labels = read_label_image(path, shape)
-    return labels, np.ones(len(np.unique(labels[labels > 0])))
+def _read(path: Path, data: bytes, shape: tuple[int, int]) -> _Masks:
+    """The masks and scores of the content of a file."""
+    if path.suffix == ".png":
+        labels = read_label_image(path, shape)
+        return labels, np.ones(len(np.unique(labels[labels > 0])))
+    with reading(path, "masks", "expected arrays of numbers from numpy.savez; objects (pickle) are not read"):
+        arrays = unpack_arrays(io.BytesIO(data), MAX_FILE)
+    return _checked(path, arrays, shape)
 
 
 def read_label_image(path: Path, shape: tuple[int, int]) -> np.ndarray:
@@ -208,9 +216,8 @@ def read_label_image(path: Path, shape: tuple[int, int]) -> np.ndarray:
     return labels
 
 
-def _read_npz(path: Path, data: bytes, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    with reading(path, "masks", "expected arrays of numbers from numpy.savez; objects (pickle) are not read"):
-        arrays = unpack_arrays(io.BytesIO(data), MAX_FILE)
+def _checked(path: Path, arrays: Mapping[str, np.ndarray], shape: tuple[int, int]) -> _Masks:
+    """The masks and scores among some arrays; InputError, with the path, if they are invalid."""
     kind = "labels" if "labels" in arrays else "masks"
     if kind not in arrays:
         raise InputError(f"{path} has no array labels or masks, only {', '.join(sorted(arrays)) or 'nothing'}")
@@ -260,10 +267,10 @@ def write_masks(
         )
     with locked(path), atomic_folder(path, "replace") as partial:
         for k, one in enumerate(alternatives):
-            name, data = partial / f"{k}.npz", _packed(one)
-            masks = np.asarray(one[0] if isinstance(one, tuple) else one)
-            _parsed({name: data}, None, masks.shape[-2:])  # the checks of the reader
-            name.write_bytes(data)
+            name, arrays = partial / f"{k}.npz", _arrays(one)
+            shape = next(iter(arrays.values())).shape[-2:]
+            _pause_masks({name: _checked(name, arrays, shape)}, None, b"")  # the checks of the reader
+            np.savez_compressed(name, **arrays)  # type: ignore[arg-type]
         if weights is not None:
             write_text(partial / _WEIGHTS, json.dumps({f"{k}.npz": float(w) for k, w in enumerate(weights)}))
             read_weights(partial, _alternatives(partial))
