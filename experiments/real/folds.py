@@ -1,4 +1,4 @@
-"""Border models that were fitted without some of the real frames."""
+"""Border models and judges of seams that were fitted without some of the real frames."""
 
 from __future__ import annotations
 
@@ -13,6 +13,10 @@ from mstfilter.base.trained import open_model, write_model
 
 #: Tensors of the corrections of the border model by fold (../segmentation_fit/correction.py)
 CORRECTIONS = load_file(Path(__file__).resolve().parent / "folds.safetensors")
+#: Folders with the judges of seams that were trained without the images of a source
+JUDGES = {
+    source: str(Path(__file__).resolve().parent.parent / "seams" / "folds" / source) for source in ("hots", "osd")
+}
 _SCRATCH = tempfile.TemporaryDirectory()
 
 

@@ -19,12 +19,12 @@ from __future__ import annotations
 import argparse
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
-from folds import border_model
+from folds import JUDGES, border_model
 from scores import identities, image_scores, kept, pixel_forecasts, witness_scores
 from sequences import SHARED, Sequence, sequences
 
@@ -64,13 +64,13 @@ FORECASTS = {"all": "", "kept": "_kept", "answer": "_answer"}
 _WORST = 12  # pauses on a contact sheet
 
 
-def held_out(sequence: Sequence, method: str, by_sequence: bool, judges: Mapping[str, str]) -> list[str]:
+def held_out(sequence: Sequence, method: str, by_sequence: bool) -> list[str]:
     """Changes to a method that was fitted to the frames of a sequence: what was fitted without its camera set-up.
 
     On frames of OSD, constants of the segmentation that were chosen on the other camera set-ups replace the defaults.
     On frames of OSD and HOTS, the border model has the correction that was fitted without the camera set-up. With
     `by_sequence`, the correction for a sequence of HOTS was fitted with the other sequences of the same camera.
-    `judges` has the judge of seams that was trained without the images of a source.
+    The judge of seams is the one that was trained without the images of the source.
     """
     if sequence.source not in ("osd", "hots") or method.startswith("floor"):
         return []
@@ -79,8 +79,7 @@ def held_out(sequence: Sequence, method: str, by_sequence: bool, judges: Mapping
     if isinstance(tree, BorderTree):
         changes = [f"proposal.tree.weights={border}"]
     elif isinstance(tree, SeamTree):
-        judge = judges.get(sequence.source, tree.weights)
-        changes = [f"proposal.tree.base.weights={border}", f"proposal.tree.weights={judge}"]
+        changes = [f"proposal.tree.base.weights={border}", f"proposal.tree.weights={JUDGES[sequence.source]}"]
     if sequence.source == "hots":
         return changes
     row = next(r for r in read_csv(CONSTANTS) if r["frames"] == sequence.name)
@@ -91,10 +90,10 @@ def held_out(sequence: Sequence, method: str, by_sequence: bool, judges: Mapping
 
 
 def run(
-    sequence: Sequence, methods: list[str], seed: int, last: int | None, by_sequence: bool, judges: Mapping[str, str]
+    sequence: Sequence, methods: list[str], seed: int, last: int | None, by_sequence: bool
 ) -> Iterator[tuple[dict[str, object], dict[str, ForecastTable]]]:
     """For each pause and method, a row of scores, and forecasts."""
-    filters = {name: preset(*METHODS[name], *held_out(sequence, name, by_sequence, judges)) for name in methods}
+    filters = {name: preset(*METHODS[name], *held_out(sequence, name, by_sequence)) for name in methods}
     states: dict[str, State] = {name: f.start(seed) for name, f in filters.items()}
     histories: dict[str, list[list[dict[str, int]]]] = defaultdict(list)  # of each hypothesis and its ancestors
     for clip in sequence.recording.clips()[:last]:
@@ -252,7 +251,6 @@ def main() -> None:
     parser.add_argument("--methods", default=",".join(METHODS).replace("mst, no past", "no past"))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--by-sequence", action="store_true", help="for HOTS, fit with its other sequences")
-    parser.add_argument("--judges", default="", help="hots=MODEL,osd=MODEL: judges of seams that have not seen them")
     parser.add_argument("--sheets", type=Path, help="draw the worst pauses of `mst` into this folder")
     options = parser.parse_args()
     if options.smoke and options.out == parser.get_default("out"):
@@ -261,7 +259,6 @@ def main() -> None:
     methods = [{"no past": "mst, no past"}.get(name, name) for name in options.methods.split(",")]
     if options.smoke:
         options.only, methods = "learn0-1", ["mst", "floor_image"]
-    judges = dict(part.split("=") for part in options.judges.split(",") if part)
     options.out.mkdir(parents=True, exist_ok=True)
     path, forecast_path = options.out / "pauses.csv", options.out / "forecasts.csv"
     rows: list[dict] = read_csv(path) if path.exists() else []
@@ -275,7 +272,7 @@ def main() -> None:
         done = {row["method"] for row in rows if row["sequence"] == sequence.name}
         missing = [name for name in methods if name not in done]
         last = 1 if options.smoke else None
-        found = list(run(sequence, missing, options.seed, last, options.by_sequence, judges))
+        found = list(run(sequence, missing, options.seed, last, options.by_sequence))
         rows += [row for row, _ in found]
         for name in missing:
             tables = [of_pause for row, of_pause in found if row["method"] == name]

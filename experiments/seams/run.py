@@ -1,7 +1,7 @@
 """How well does the tree with seams tell one object from two, in simulated and in real images?
 
     python experiments/seams/run.py --samples FOLDER      # training samples of the labelled real images
-    python experiments/seams/run.py [--judge MODEL] [--fold hots=MODEL,osd=MODEL] [--priors .85:3.5,.5:1000]
+    python experiments/seams/run.py [--judge MODEL] [--priors .85:3.5,.5:1000]
         [--scenes s1,s2,s3] [--seeds 0-9] [--no-real] [--out FOLDER]
     python experiments/seams/run.py --smoke --out FOLDER
 
@@ -43,7 +43,7 @@ from mstfilter.scoring.forecasts import ForecastTable
 
 REAL = Path(__file__).resolve().parent.parent / "real"
 sys.path.append(str(REAL))
-from folds import border_model  # noqa: E402
+from folds import JUDGES, border_model  # noqa: E402
 from scores import SOFTENING, PixelPairs  # noqa: E402
 from sequences import SHARED, sequences  # noqa: E402
 
@@ -145,7 +145,6 @@ def scored(image: Labelled, proposal: TreeCutProposal) -> dict[str, float]:
 
 def main(options: argparse.Namespace) -> None:
     """Score the trees and write the tables."""
-    folds = dict(part.split("=") for part in options.fold.split(",")) if options.fold else {}
     priors = [tuple(float(n) for n in prior.split(":")) for prior in options.priors.split(",")]
     first, last = (int(n) for n in (options.seeds.split("-") * 2)[:2])
     rows: Rows = []
@@ -153,7 +152,7 @@ def main(options: argparse.Namespace) -> None:
     real = () if options.no_real else islice(real_images(), 0, None, options.every)
     for image in chain(simulated, real):
         base = BorderTree(weights=border_model(image.name))
-        judge = folds.get(image.group, options.judge)
+        judge = JUDGES.get(image.group, options.judge) if options.judge else ""
         trees: list[tuple[str, str, BorderTree | SeamTree]] = [] if options.no_base else [("border", "", base)]
         if judge:
             trees += [
@@ -197,7 +196,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--samples", type=Path, help="write training samples of the real images into this folder")
     parser.add_argument("--judge", default="seams", help="model of the judge for simulated images; empty for none")
-    parser.add_argument("--fold", default="", help="hots=MODEL,osd=MODEL: judges that have not seen these frames")
     parser.add_argument("--priors", default="0.85:3.5", help="one_share:prior_size, separated by commas")
     parser.add_argument("--scenes", default="s1,s2,s3")
     parser.add_argument("--seeds", default="0-9")

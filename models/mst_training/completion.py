@@ -26,7 +26,7 @@ from torch.nn import functional
 
 from mst_training.completion_data import MASK_KINDS, CompletionSamples, LargeSamples
 from mst_training.loop import Training, fit_calibration
-from mst_training.scenes import Clutter, Samples
+from mst_training.scenes import Samples
 from mst_training.shapes import HELD_OUT
 from mstfilter.mst.completion.crops import CHANNELS, EDGE, LARGER, LATTICE, PRIOR, channels, extruded
 from mstfilter.mst.completion.unet import ARCHITECTURE, CompletionNet
@@ -42,7 +42,6 @@ class CompletionTraining(Training):
 
     n_globals: int = 16  #: number of global features
     prior: bool = False  #: the mean of `Posterior` is a channel
-    objects: str = ""  #: folder of meshes; none if empty
     n_large: int = 200  #: further scenes for training, with larger objects
     stretch: float = 0.3  #: crops are stretched by up to exp(stretch), in height by up to another exp(stretch / 2)
     large: float = 0.2  #: share of the batches with crops of larger objects; they have as many voxels as others
@@ -72,12 +71,6 @@ class CompletionTraining(Training):
         stem, n = tensors["stem.weight"], 8 * len(self.channels)
         more = stem.new_zeros(len(stem), max(n - stem.shape[1], 0), *stem.shape[2:])
         return {**tensors, "stem.weight": torch.cat([stem, more], dim=1)}
-
-    def clutter(self, part: str) -> Clutter:
-        usual = super().clutter(part)
-        if part == "test" or not self.objects:
-            return usual
-        return replace(usual, objects=self.objects, pool="training" if part == "train" else "tuning")
 
     def make_samples(self, folder: Path, workers: int) -> dict[str, list[Path]]:
         files = super().make_samples(folder, workers)

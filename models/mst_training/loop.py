@@ -31,6 +31,7 @@ from mstfilter.base.errors import InputError, check_choice
 from mstfilter.base.files import atomic_path, read_csv, write_csv, write_text
 from mstfilter.base.reading import read_text
 from mstfilter.base.trained import DESCRIPTION, open_model, write_model
+from mstfilter.lab.simulation.objects import MeshPool
 
 _STATE = "state.safetensors"
 _SAVE_EVERY = 120.0  # seconds between saved states
@@ -52,6 +53,7 @@ class Training(ABC):
     rate: float = 2e-3  #: largest learning rate; it falls to 0 along a cosine
     average: float = 0.999  #: decay of the moving average of the weights
     half_precision: bool = True  #: compute in bfloat16; without hardware for it, that is slower by a factor of 2.5
+    objects: str = ""  #: folder of meshes, of which the scenes have some; none if empty
     start: str = ""  #: name or folder of a model of the same size whose weights are the start; none if empty
 
     #: Changes of the settings by name. "cpu" takes about four core hours, "smoke" shows that everything works.
@@ -81,7 +83,10 @@ class Training(ABC):
     def clutter(self, part: str) -> Clutter:
         """What the scenes of the training, validation or test (``part``) look like."""
         usual = self.samples.clutter
-        return replace(usual, kinds=TRAINED + HELD_OUT) if part == "test" else usual
+        if part == "test":
+            return replace(usual, kinds=TRAINED + HELD_OUT)
+        pool: MeshPool = "training" if part == "train" else "tuning"
+        return replace(usual, objects=self.objects, pool=pool) if self.objects else usual
 
     def make_samples(self, folder: Path, workers: int) -> dict[str, list[Path]]:
         """Files with samples for validation, test and training; those that exist are kept."""

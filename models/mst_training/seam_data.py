@@ -3,10 +3,11 @@
 >>> samples = SeamSamples.of_scene(seed=0, index=3)             # always the same
 >>> samples.x.shape, samples.strip.shape, samples.purity
 
-Half of the scenes ask the question: in `row`, `stack` and `pack`, things that look like several objects are one as
-often as not. The others are `s1` to `s3`. Cameras and sensors are drawn at random, sizes and textures are those for
-tuning. The regions are those that `SeamTree` examines in the tree `border`, and below those of several objects the
-sides of the best division. Some of the regions that plainly are one object are left out.
+More than half of the scenes ask the question: in `row`, `stack` and `pack`, things that look like several objects are
+one as often as not. They have two to four groups each. The others are `s1` to `s3` and, if the clutter names a
+folder of meshes, `m1` and `m2`. Cameras and sensors are drawn at random, sizes and textures are those for tuning. The
+regions are those that `SeamTree` examines in the tree `border`, and below those of several objects the sides of the
+best division. Some of the regions that plainly are one object are left out.
 
 Real images with label images give samples in the same way:
 
@@ -33,10 +34,11 @@ from mstfilter.mst.segmentation.seam_measures import SeamMeasures
 from mstfilter.mst.segmentation.seams import BaseTree, least_examined, within
 from mstfilter.scene import Camera, Frame, VoxelGrid, look_at, scene_cache
 
-_FAMILIES = {"row": 0.25, "stack": 0.25, "pack": 0.12, "s1": 0.12, "s2": 0.16, "s3": 0.10}
+_FAMILIES = {"row": 0.26, "stack": 0.22, "pack": 0.10, "s1": 0.12, "s2": 0.18, "s3": 0.12}
+_MESHES = {"m1": 0.08, "m2": 0.08}  # in place of as large a share of the others
 _GROUPED = ("row", "stack", "pack")
 _OWN_CAMERA = 0.35  # share of the images that the camera of the family takes
-_N_VIEWS = 3
+_N_VIEWS = 2
 _FIRST_SEED = 1_000_000  # of scenes; the studies use smaller ones
 #: An object counts if so many of its pixels are in a region, and such a share of the region or of its own pixels.
 _LEAST_PIXELS, _LEAST_SHARE, _LEAST_OWN = 120, 0.15, 0.4
@@ -63,11 +65,11 @@ class SeamSamples(Samples):
 
     @classmethod
     def of_scene(cls, seed: int, index: int, clutter: Clutter | None = None) -> Self:
-        """The samples of scene number `index`; `clutter` is not used."""
+        """The samples of scene number `index`; of `clutter`, only the meshes are used."""
         for attempt in range(20):
             rng = np.random.default_rng([seed, index, attempt])
             try:
-                rows = [*_rows(rng, _FIRST_SEED * (1 + seed) + 20 * index + attempt)]
+                rows = [*_rows(rng, _FIRST_SEED * (1 + seed) + 20 * index + attempt, clutter or Clutter())]
             except InputError:  # the objects do not fit
                 continue
             finally:
@@ -107,11 +109,18 @@ class SeamSamples(Samples):
 _Row = tuple[np.ndarray, np.ndarray, np.ndarray, int, int, bool]
 
 
-def _rows(rng: np.random.Generator, seed: int) -> Iterator[_Row]:
+def _rows(rng: np.random.Generator, seed: int, clutter: Clutter) -> Iterator[_Row]:
     """The regions of some images of a scene."""
-    name = str(rng.choice([*_FAMILIES], p=[*_FAMILIES.values()]))
+    shares = _FAMILIES | (_MESHES if clutter.objects else {})
+    p = np.array([*shares.values()])
+    name = str(rng.choice([*shares], p=p / p.sum()))
     sensor: Any = str(rng.choice(["xtion", "xtion", "xtion", *SENSORS]))
     family = replace(scene_family(name), n_actions=0, catalogue="tuning", sensor=sensor, arm=False, one_share=0.5)
+    if name in _GROUPED:
+        n = int(rng.integers(2, 5))
+        family = replace(family, n_groups=n, n_objects_min=n + 1, n_objects_max=n + 2)
+    elif name in _MESHES:
+        family = replace(family, objects=clutter.objects, mesh_pool=clutter.pool)
     scene, tree = SimulatedScene(family, seed), BorderTree()
     for _ in range(_N_VIEWS):
         camera = family.camera() if rng.uniform() < _OWN_CAMERA else _camera(rng, scene)
