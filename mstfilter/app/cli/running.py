@@ -27,13 +27,7 @@ from mstfilter.app.report.progress import progress_bar
 from mstfilter.base.errors import InputError, check_choice
 from mstfilter.base.files import atomic_folder, check_output, locked, write_csv, write_text
 
-#: The demo: a row of parts that touch, which a push takes apart, and a small object behind a tall one.
-_DEMO_FAMILY = "occlusion"
-_DEMO_FIELDS = (
-    *("n_objects_min=6", "n_objects_max=6", "n_hidden=1"),
-    *("groups=row", "n_groups=1", "push_aims=apart", "min_moved=1"),
-)
-_DEMO_FILTER = ("proposal.tree=seams",)  # asks of things that touch whether they are one object
+_DEMO = "occlusion"  # the family of the demo
 
 
 @app.command()
@@ -127,7 +121,7 @@ def demo(
     out: Annotated[Path, typer.Option(help="New folder for recording, run and report.")] = Path("demo"),
     seed: Seed = 3,
 ) -> None:
-    """Simulate a robot that pushes a row of things apart, filter the images with and without past, write a report."""
+    """Simulate a robot at a cluttered table, filter the recording with and without predictions, write a report."""
     from mstfilter.app.report import read_numbers, write_report
     from mstfilter.formats import open_recording
     from mstfilter.runs import RunFolder, compared_configs
@@ -135,8 +129,8 @@ def demo(
 
     check_output(out, folder=True)
     with locked(out), atomic_folder(out) as work:
-        _simulate(_DEMO_FAMILY, work / "recording", seed, _DEMO_FIELDS)
-        recording, config = open_recording(work / "recording"), load_config("mst", _DEMO_FILTER)
+        _simulate(_DEMO, work / "recording", seed)
+        recording, config = open_recording(work / "recording"), load_config("mst")
         _execute_all(recording, {"": config} | compared_configs(config), work / "run", 0)
         run = RunFolder.open(work / "run")
         numbers = read_numbers(run)
