@@ -59,7 +59,7 @@ def pause_documents(run: RunFolder, pauses: Iterable[int] | None = None, reach: 
         about = {"pause": t, "frame": known["pauses"][t], "time": known["times"][t]}
         borders = belief.open_borders(camera)
         if reach is not None:
-            pushes = push_candidates(belief, camera, reach, borders=borders) if len(tables[t]) else []
+            pushes = push_candidates(belief, camera, reach, borders=borders) if belief.estimate().n_objects else []
             about["pushes"] = [push.row() for push in pushes]
         documents.append(pause_document(tables[t], borders, **about))
     return documents
