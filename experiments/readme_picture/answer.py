@@ -14,11 +14,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
-import numpy as np
 
 import mstfilter
 from mstfilter import Belief
-from mstfilter.app.report.answer import Answer, draw_answer
+from mstfilter.app.report.answer import Answer, Arrow, draw_answer
 from mstfilter.lab.simulation import PushLoop, scene_family
 from mstfilter.mst.belief import push_candidates
 
@@ -51,14 +50,11 @@ def main() -> None:
         shown.append((loop.clip.after.rgb, Answer.of(belief, belief.objects(previous=table), camera)))
     _, _, width, height = shown[0][1].box
     figure, axes = plt.subplots(1, len(shown), figsize=(12, 6 * height / width), layout="constrained", squeeze=False)
-    for place, (image, answer) in zip(axes[0], shown, strict=True):
+    played = [Arrow.of(push, camera, push.label) for push in pushes[:1]]
+    for place, (image, answer), push in zip(axes[0], shown, [*played, None], strict=True):
         print(*answer.sentences)
         borders = [one for one in answer.borders if LEAST < one.one_object < 1 - LEAST]
-        draw_answer(place, replace(answer, box=shown[0][1].box, borders=borders, push=None), image)
-    for push in pushes[:1]:
-        (x, y), (u, v) = camera.project(np.array([push.contact - 0.06 * push.direction, push.contact]))[0]
-        arrow = {"arrowstyle": "-|>,head_width=0.5,head_length=0.9", "color": "#f6f6f2", "lw": 4}
-        axes[0, 0].annotate("", (u, v), (x, y), arrowprops=arrow)
+        draw_answer(place, replace(answer, box=shown[0][1].box, borders=borders, push=push), image)
     figure.savefig(options.out, dpi=100)
 
 

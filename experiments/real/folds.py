@@ -11,12 +11,12 @@ from sequences import FOLDS
 
 from mstfilter.base.trained import open_model, write_model
 
+HERE = Path(__file__).resolve().parent
+
 #: Tensors of the corrections of the border model by fold (../segmentation_fit/correction.py)
-CORRECTIONS = load_file(Path(__file__).resolve().parent / "folds.safetensors")
+CORRECTIONS = load_file(HERE / "folds.safetensors")
 #: Folders with the judges of seams that were trained without the images of a source
-JUDGES = {
-    source: str(Path(__file__).resolve().parent.parent / "seams" / "folds" / source) for source in ("hots", "osd")
-}
+JUDGES = {source: str(HERE.parent / "seams" / "folds" / source) for source in ("hots", "osd")}
 _SCRATCH = tempfile.TemporaryDirectory()
 
 

@@ -152,9 +152,9 @@ def main(options: argparse.Namespace) -> None:
     real = () if options.no_real else islice(real_images(), 0, None, options.every)
     for image in chain(simulated, real):
         base = BorderTree(weights=border_model(image.name))
-        judge = JUDGES.get(image.group, options.judge) if options.judge else ""
         trees: list[tuple[str, str, BorderTree | SeamTree]] = [] if options.no_base else [("border", "", base)]
-        if judge:
+        if options.judge:
+            judge = JUDGES.get(image.group, options.judge)
             trees += [
                 ("seams", f"{share}:{size}", SeamTree(base=base, weights=judge, one_share=share, prior_size=size))
                 for share, size in priors

@@ -32,7 +32,7 @@ from matplotlib.patches import Polygon
 from mstfilter.app.report.charts import Drawing
 from mstfilter.app.report.export import mesh_bytes
 from mstfilter.app.report.pictures import border_colour, close_up, colour, hexadecimal
-from mstfilter.mst.belief import Belief, BelievedObject, Border, ObjectTable, push_candidates
+from mstfilter.mst.belief import Belief, BelievedObject, Border, ObjectTable, PushCandidate, push_candidates
 from mstfilter.runs import RunFolder
 from mstfilter.scene import Camera, project, render
 
@@ -99,6 +99,12 @@ class Arrow(NamedTuple):
     start: Point  #: (column, row)
     end: Point  #: the contact
     number: int  #: of the object that is pushed
+
+    @classmethod
+    def of(cls, push: PushCandidate, camera: Camera, number: int) -> Arrow:
+        """The arrow of a push against the object with a number."""
+        (x, y), (u, v) = camera.project(np.array([push.contact - _ARROW * push.direction, push.contact]))[0].tolist()
+        return cls((x, y), (u, v), number)
 
 
 @dataclass(frozen=True, eq=False)
@@ -383,9 +389,7 @@ def _push(belief: Belief, camera: Camera, borders: Sequence[Border], number_of: 
     for best in push_candidates(belief, camera, (grid.origin, grid.upper), borders=borders):
         number = number_of.get(best.label)
         if number is not None:
-            ends = np.array([best.contact - _ARROW * best.direction, best.contact])
-            (x, y), (u, v) = camera.project(ends)[0].tolist()
-            return Arrow((x, y), (u, v), number)
+            return Arrow.of(best, camera, number)
     return None
 
 
